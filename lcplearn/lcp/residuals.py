@@ -51,10 +51,10 @@ def equilibrate(M: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n"]:
 
 def smoothed_minimum(a: Tensor, b: Tensor, tau: Tensor | float) -> Tensor:
     """min(a, b), or for tau > 0 the root that is zero where a b = tau, written without cancellation near it."""
+    if not isinstance(tau, Tensor) and tau == 0:
+        return torch.minimum(a, b)
     root = torch.sqrt((a - b).square() + 4 * tau)
-    near = 2 * (a * b - tau) / (a + b + root)
-    smooth = torch.where(a + b > 0, near, (a + b - root) / 2)
-    return torch.where(torch.as_tensor(tau > 0), smooth, torch.minimum(a, b))
+    return torch.where(a + b > 0, 2 * (a * b - tau) / (a + b + root), (a + b - root) / 2)
 
 
 def judge(
@@ -82,7 +82,7 @@ def judge(
     z_size = z.abs().amax(-1, keepdim=True)
     omega = q.abs() + absMz
     product = z_size * omega
-    tau = torch.where(product > 0, smoothing / product, 0.0)
+    tau = torch.where(product > 0, smoothing / product, 0.0) if smoothing else 0.0
     rows = smoothed_minimum(_ratio(z, z_size), _ratio(w, omega), tau).abs().amax(-1)
     residual = torch.maximum(_ratio(natural, q_size), rows)
     residual = torch.where(residual.isfinite(), residual, torch.inf)
