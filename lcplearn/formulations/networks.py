@@ -1,0 +1,51 @@
+"""Small building blocks shared by the formulations: features of (v, u), affine maps and networks, in float64."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+
+def features(velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"], dt: float) -> Float[Tensor, "*batch 2"]:
+    """Stack velocity [m/s] and impulse of the applied force, u dt [N s].
+
+    The impulse rather than the force, so that an affine map's coefficient is 1 / mass: of order one whatever dt is.
+    """
+    return torch.stack(torch.broadcast_tensors(velocity, force * dt), dim=-1)
+
+
+def network(inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> nn.Sequential:
+    """Fully connected network with `depth` hidden layers of `width` units.
+
+    Args:
+        inputs: Number of inputs.
+        outputs: Number of outputs; the last layer is affine.
+        width: Units of a hidden layer; >= 1.
+        depth: Hidden layers; >= 1.
+        activation: "relu" or "tanh".
+
+    Raises:
+        ValueError: width or depth below one, or an unknown activation.
+    """
+    if width < 1 or depth < 1:
+        raise ValueError(f"width and depth must be at least 1, got width={width}, depth={depth}.")
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {activation!r}.")
+    layers: list[nn.Module] = []
+    for _ in range(depth):
+        layers += [nn.Linear(inputs, width, dtype=torch.float64), ACTIVATIONS[activation]()]
+        inputs = width
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs, dtype=torch.float64))
+
+
+def log_parameter(name: str, value: float) -> nn.Parameter:
+    """Logarithm of a positive quantity as a parameter, so that training can't make the quantity negative."""
+    return nn.Parameter(torch.tensor(positive(name, value), dtype=torch.float64).log())
+
+
+def positive(name: str, value: float) -> float:
+    """Return `value` if it is positive and finite, else raise a ValueError that names it."""
+    if not 0.0 < value < float("inf"):
+        raise ValueError(f"{name} must be positive and finite, got {value}.")
+    return float(value)

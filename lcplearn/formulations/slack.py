@@ -1,0 +1,35 @@
+"""Velocity affine in slack friction (the notes' 3.1.2), deployed as its own LCP."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lcplearn.formulations.direct import KnownFriction
+
+
+class Slack(KnownFriction):
+    """Learn the velocity from measured slack friction; predict by solving for the slack.
+
+    training:    (v+, v-) = f(v, u) + G s dt          with the measured slack s = (lambda'-, lambda'+)
+    prediction:  0 <= s dt  ⊥  f(v, u) + G s dt >= 0,   v_{k+1} = v+ - v- = w_0 - w_1
+
+    Velocity and slack are complementary, so what was learned is an LCP and a prediction needs no friction. Where both
+    slacks are positive both velocities are exactly zero, with any f and G: the block sticks. Where G is not a P-matrix
+    the LCP may have no solution; `last_solution` says so.
+
+    Source: notes section 3.1.2; errata 20, 21; learning.md B2.
+    """
+
+    def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
+        super().__init__(dt=dt, gravity=gravity)
+        with torch.no_grad():
+            self.G += torch.eye(2, dtype=torch.float64)  # unit mass: the first predictions are solvable LCPs
+
+    def next_velocity(
+        self,
+        velocity: Float[Tensor, "*batch"],
+        force: Float[Tensor, "*batch"],
+        friction: Float[Tensor, "*batch 2"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        parts = self.solve(self.G, self.free_parts(velocity, force)).w
+        return parts[..., 0] - parts[..., 1]

@@ -1,0 +1,174 @@
+"""LCP in the loop with the zeros and ones of the friction problem kept: the models that stick exactly."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from lcplearn.formulations.formulation import Formulation
+from lcplearn.formulations.networks import features, log_parameter, network, positive
+
+
+class FrictionLCP(Formulation):
+    """Solve the two-row friction LCP of a learned free velocity b, inverse mass a and impulse limit c.
+
+    0 <= (v+, v-)  ⊥  (c - b / a + v+ / a,  c + b / a + v- / a) >= 0,   v_{k+1} = v+ - v- = S(b, a c)
+
+    with S(b, l) = sign(b) max(|b| - l, 0). Only b, a > 0 and c > 0 are learned, so the block sticks exactly wherever
+    |b| <= a c, whatever errors the learned values have. Subclasses say what b, a and c are.
+
+    Attributes:
+        temperature: Softening T of the threshold [m/s]; at 0 the LCP is solved. Above 0, T softplus((+-b - a c) / T)
+            replaces (v+, v-): its gradient with respect to c is nowhere zero, so training may start with it where no
+            sample is predicted to slip (the plateau) and anneal it to 0. Predictions are made at 0.
+
+    Source: notes section 3.2; learning.md B3.
+    """
+
+    def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
+        super().__init__(dt=dt, gravity=gravity)
+        self.temperature = 0.0
+
+    def free_velocity(
+        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """b: the velocity after a step without friction [m/s]."""
+        raise NotImplementedError
+
+    def inverse_mass(self) -> Float[Tensor, ""]:
+        """a: velocity change per friction impulse [1/kg]; > 0."""
+        raise NotImplementedError
+
+    def impulse_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+        """c: the largest friction impulse of one step [N s]; > 0."""
+        raise NotImplementedError
+
+    def velocity_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+        """a c: the largest change of velocity that friction can make in one step [m/s]."""
+        return self.inverse_mass() * self.impulse_limit(velocity)
+
+    def next_velocity(
+        self,
+        velocity: Float[Tensor, "*batch"],
+        force: Float[Tensor, "*batch"],
+        friction: Float[Tensor, "*batch 2"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        b = self.free_velocity(velocity, force)
+        signed = torch.stack((b, -b), dim=-1)
+        if self.temperature > 0.0:
+            excess = signed - self.velocity_limit(velocity)[..., None]
+            parts = self.temperature * softplus(excess / self.temperature)
+        else:
+            a = self.inverse_mass()
+            M = torch.eye(2, dtype=b.dtype, device=b.device) / a
+            q = self.impulse_limit(velocity)[..., None] - signed / a
+            parts = self.solve(M, q, method="diagonal").z
+        return parts[..., 0] - parts[..., 1]
+
+
+class Structured(FrictionLCP):
+    """Learn b, a and c of the friction LCP, each affine, constant or a network.
+
+    b = b_v v + b_u u + b_0 (or v + net(v, u dt)),   a = exp(log a),   c = exp(log c) (or exp(log c + net(v)))
+
+    Only the product a c has an effect on the motion. Read-outs: mass = dt / b_u and mu = a c / (g dt).
+
+    Args:
+        dt: Time step [s].
+        gravity: Acceleration of gravity [m/s^2].
+        initial_mu: Friction coefficient at the start; > 0. Well below the expected one: if no sample is predicted to
+            slip, the prediction loss has no gradient.
+        initial_mass: Mass at the start [kg]; > 0.
+        b_network: Learn the free velocity by a network.
+        c_network: Learn the impulse limit by a network of the velocity.
+        width: Units of the networks' hidden layers.
+        depth: Hidden layers of the networks.
+    """
+
+    def __init__(
+        self,
+        *,
+        dt: float,
+        gravity: float = 9.81,
+        initial_mu: float = 0.1,
+        initial_mass: float = 1.0,
+        b_network: bool = False,
+        c_network: bool = False,
+        width: int = 64,
+        depth: int = 2,
+    ) -> None:
+        super().__init__(dt=dt, gravity=gravity)
+        mass, mu = positive("initial_mass", initial_mass), positive("initial_mu", initial_mu)
+        self.log_a = log_parameter("initial_mass", 1.0 / mass)
+        self.log_c = log_parameter("initial_mu", mu * mass * gravity * dt)
+        self.b_weight = nn.Parameter(torch.tensor([1.0, 1.0 / mass], dtype=torch.float64))
+        self.b_bias = nn.Parameter(torch.zeros((), dtype=torch.float64))
+        self.b_net = network(2, 1, width=width, depth=depth, activation="tanh") if b_network else None
+        self.c_net = network(1, 1, width=width, depth=depth, activation="tanh") if c_network else None
+
+    def free_velocity(
+        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        inputs = features(velocity, force, self.dt)
+        b = inputs @ self.b_weight + self.b_bias
+        return b if self.b_net is None else b + self.b_net(inputs)[..., 0]
+
+    def inverse_mass(self) -> Float[Tensor, ""]:
+        return self.log_a.exp()
+
+    def impulse_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+        log_c = self.log_c if self.c_net is None else self.log_c + self.c_net(velocity[..., None])[..., 0]
+        return log_c.exp()
+
+    def physical_parameters(self) -> dict[str, float]:
+        values = {}
+        if self.c_net is None:
+            values["mu"] = (self.log_a + self.log_c).exp().item() / (self.gravity * self.dt)
+        if self.b_net is None:
+            values["mass"] = 1.0 / self.b_weight[1].item()
+        return values
+
+
+class Physical(FrictionLCP):
+    """Learn friction coefficient and mass of the sliding block.
+
+    b = v + u dt / m,   a = 1 / m,   c = mu m g dt,   from log mu and log m
+
+    Args:
+        dt: Time step [s].
+        gravity: Acceleration of gravity [m/s^2].
+        initial_mu: Friction coefficient at the start; > 0, well below the expected one (see `Structured`).
+        initial_mass: Mass [kg] at the start, or for good if it isn't learned; > 0.
+        learn_mass: False keeps the mass, for instance where no force is applied and it has no effect.
+    """
+
+    def __init__(
+        self,
+        *,
+        dt: float,
+        gravity: float = 9.81,
+        initial_mu: float = 0.1,
+        initial_mass: float = 1.0,
+        learn_mass: bool = True,
+    ) -> None:
+        super().__init__(dt=dt, gravity=gravity)
+        self.log_mu = log_parameter("initial_mu", initial_mu)
+        self.log_mass = log_parameter("initial_mass", initial_mass)
+        self.log_mass.requires_grad_(learn_mass)
+
+    def free_velocity(
+        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        return velocity + force * self.dt * self.inverse_mass()
+
+    def inverse_mass(self) -> Float[Tensor, ""]:
+        return (-self.log_mass).exp()
+
+    def impulse_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+        return (self.log_mu + self.log_mass).exp() * (self.gravity * self.dt)
+
+    def physical_parameters(self) -> dict[str, float]:
+        values = {"mu": self.log_mu.exp().item()}
+        if self.log_mass.requires_grad:
+            values["mass"] = self.log_mass.exp().item()
+        return values
