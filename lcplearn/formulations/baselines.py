@@ -55,7 +55,8 @@ class MLP(Formulation):
         force: Float[Tensor, "*batch"],
         friction: Float[Tensor, "*batch 2"] | None = None,
     ) -> Float[Tensor, "*batch"]:
-        return velocity + self.net(features(velocity, force, self.dt))[..., 0]
+        change: Tensor = self.net(features(velocity, force, self.dt))
+        return velocity + change[..., 0]
 
 
 class ForceMLP(Formulation):
@@ -96,7 +97,8 @@ class ForceMLP(Formulation):
     ) -> Float[Tensor, "*batch"]:
         """Predicted friction force [N]."""
         # The network's output is an impulse of order one: its division by dt keeps it learnable when dt is small.
-        return self.net(features(velocity, force, self.dt))[..., 0] / self.dt
+        impulse: Tensor = self.net(features(velocity, force, self.dt))
+        return impulse[..., 0] / self.dt
 
     def next_velocity(
         self,

@@ -12,7 +12,9 @@ def features(velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"], 
 
     The impulse rather than the force, so that an affine map's coefficient is 1 / mass: of order one whatever dt is.
     """
-    return torch.stack(torch.broadcast_tensors(velocity, force * dt), dim=-1)
+    impulse = force * dt
+    shape = torch.broadcast_shapes(velocity.shape, impulse.shape)
+    return torch.stack((velocity.expand(shape), impulse.expand(shape)), dim=-1)
 
 
 def network(inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> nn.Sequential:
@@ -22,14 +24,14 @@ def network(inputs: int, outputs: int, *, width: int, depth: int, activation: st
         inputs: Number of inputs.
         outputs: Number of outputs; the last layer is affine.
         width: Units of a hidden layer; >= 1.
-        depth: Hidden layers; >= 1.
+        depth: Hidden layers; 0 is an affine map.
         activation: "relu" or "tanh".
 
     Raises:
-        ValueError: width or depth below one, or an unknown activation.
+        ValueError: width below one, negative depth, or an unknown activation.
     """
-    if width < 1 or depth < 1:
-        raise ValueError(f"width and depth must be at least 1, got width={width}, depth={depth}.")
+    if width < 1 or depth < 0:
+        raise ValueError(f"width must be at least 1 and depth at least 0, got width={width}, depth={depth}.")
     if activation not in ACTIVATIONS:
         raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {activation!r}.")
     layers: list[nn.Module] = []

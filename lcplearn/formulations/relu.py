@@ -1,5 +1,7 @@
 """ReLU on the decomposed velocities (the notes' Remark 4)."""
 
+from typing import cast
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -23,27 +25,19 @@ class ReLU(Formulation):
     Args:
         dt: Time step [s].
         gravity: Acceleration of gravity [m/s^2].
-        use_network: Put a tanh network below the rectified outputs.
         width: Units of a hidden layer.
-        depth: Hidden layers.
+        depth: Hidden layers below the rectified outputs; 0 makes them affine in (v, u dt).
 
     Source: notes Remark 4; learning.md B2.
     """
 
-    def __init__(
-        self, *, dt: float, gravity: float = 9.81, use_network: bool = False, width: int = 64, depth: int = 1
-    ) -> None:
+    def __init__(self, *, dt: float, gravity: float = 9.81, width: int = 64, depth: int = 0) -> None:
         super().__init__(dt=dt, gravity=gravity)
-        # The network's last layer, from h to (v+, v-), is `output` in both cases.
-        self.trunk: nn.Sequential | None = None
-        if use_network:
-            *hidden, output = network(2, 2, width=width, depth=depth, activation="tanh")
-            self.trunk, self.output = nn.Sequential(*hidden), output
-        else:
-            self.output = nn.Linear(2, 2, dtype=torch.float64)
+        self.net = network(2, 2, width=width, depth=depth, activation="tanh")
+        output = cast(nn.Linear, self.net[-1])
         with torch.no_grad():
-            self.output.weight[1] = -self.output.weight[0]
-            self.output.bias.fill_(INITIAL_BIAS)
+            output.weight[1] = -output.weight[0]
+            output.bias.fill_(INITIAL_BIAS)
 
     def velocity_parts(
         self,
@@ -52,8 +46,7 @@ class ReLU(Formulation):
         friction: Float[Tensor, "*batch 2"] | None = None,
     ) -> Float[Tensor, "*batch 2"]:
         """Predict (v+, v-) >= 0 [m/s]."""
-        h = features(velocity, force, self.dt)
-        return relu(self.output(h if self.trunk is None else self.trunk(h)))
+        return relu(self.net(features(velocity, force, self.dt)))
 
     def next_velocity(
         self,

@@ -23,7 +23,7 @@ class Slack(KnownFriction):
     def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
         super().__init__(dt=dt, gravity=gravity)
         with torch.no_grad():
-            self.G += torch.eye(2, dtype=torch.float64)  # unit mass: the first predictions are solvable LCPs
+            self.G.copy_(torch.eye(2))  # unit mass: the first predictions are solvable LCPs
 
     def next_velocity(
         self,
