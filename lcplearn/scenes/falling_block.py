@@ -59,7 +59,9 @@ class FallingBlock:
         gap, velocity = state.unbind(-1)
         next_gap = solve_lcp(*self.lcp(gap, velocity, force[..., 0]), method="diagonal").z[..., 0]
         # (x_{k+1} - x_k) / dt, written so that rest is exactly 0 and free flight has no cancellation
-        next_velocity = torch.where(next_gap > 0, self._free_velocity(velocity, force[..., 0]), -gap / self.dt)
+        next_velocity = torch.where(
+            next_gap > 0, self._free_velocity(velocity, force[..., 0]), (next_gap - gap) / self.dt
+        )
         mode = torch.where(next_gap > 0, int(Mode.SEPARATION), int(Mode.STICK))
         return torch.stack((next_gap, next_velocity), dim=-1), mode.unsqueeze(-1)
 
@@ -110,7 +112,7 @@ class BouncingBlock:
         solution = solve_lcp(*self.lcp(velocity, force[..., 0]), method="diagonal")
         in_contact = (gap + self.dt * velocity <= 0) & (solution.z[..., 0] == 0)
         next_velocity = torch.where(
-            in_contact, -self.restitution * velocity, self._free_velocity(velocity, force[..., 0])
+            in_contact, 0.0 - self.restitution * velocity, self._free_velocity(velocity, force[..., 0])
         )
         mode = torch.where(in_contact, int(Mode.STICK), int(Mode.SEPARATION))
         return torch.stack((gap + self.dt * next_velocity, next_velocity), dim=-1), mode.unsqueeze(-1)

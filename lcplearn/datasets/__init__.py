@@ -1,0 +1,18 @@
+"""Recordings of blocks, simulated and real, and batches of them."""
+
+from lcplearn.datasets.cube_slides import read_cube_slides
+from lcplearn.datasets.files import find
+from lcplearn.datasets.loader import WindowLoader
+from lcplearn.datasets.recordings import BlockData, Recordings, windows
+from lcplearn.datasets.simulate import simulate_falling_block, simulate_sliding_block
+
+__all__ = [
+    "BlockData",
+    "Recordings",
+    "WindowLoader",
+    "find",
+    "read_cube_slides",
+    "simulate_falling_block",
+    "simulate_sliding_block",
+    "windows",
+]

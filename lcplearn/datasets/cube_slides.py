@@ -1,0 +1,89 @@
+"""Real recordings: a plastic cube that slides to rest on a board."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lcplearn.datasets.files import check_offsets, find, read_npz
+from lcplearn.datasets.recordings import BlockData, Recordings
+
+FILE = "cube_slides.npz"
+COLUMNS = ("t_s", "s_m", "v_m_s", "lateral_m", "z_m", "yaw_rate_rad_s")
+
+
+def read_cube_slides(
+    path: Path | str | None = None, *, seed: int = 0, training_slides: int = 40, validation_slides: int = 8
+) -> BlockData:
+    """Real slides of a cube to rest, split at random by slide.
+
+    No force acts but gravity and friction, so that only mu can be learned: mass is the published one.
+
+    Args:
+        path: The file; None for cube_slides.npz where `find` looks.
+        seed: Seed of the split.
+        training_slides: Slides to learn from, validation included. All others are the test set.
+        validation_slides: How many of these validate instead of train.
+
+    Returns:
+        The data; mu is None, because nobody knows it.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not what `lcplearn.datasets.contactnets` writes, or has too few slides for the split.
+    """
+    path = find(FILE) if path is None else Path(path)
+    arrays = read_npz(path, ("data", "offsets", "columns", "dt", "g", "mass_kg"))
+    data, offsets, dt = arrays["data"], arrays["offsets"], float(_scalar(path, "dt", arrays["dt"]))
+    columns = tuple(str(name) for name in np.atleast_1d(arrays["columns"]))
+    if columns != COLUMNS or data.ndim != 2 or data.shape[1] != len(COLUMNS) or data.dtype.kind != "f":
+        raise ValueError(
+            f"{path}: expected the columns {', '.join(COLUMNS)}, got {', '.join(columns)} "
+            f"and data of {data.dtype} {list(data.shape)}"
+        )
+    if len(data) == 0:
+        raise ValueError(f"{path}: expected at least one slide, got no rows")
+    check_offsets(path, offsets, len(data))
+    count = len(offsets) - 1
+    if not 0 < validation_slides < training_slides < count:
+        raise ValueError(
+            "training_slides, validation_slides: expected 0 < validation_slides < training_slides < "
+            f"{count} (the slides in {path}), got {training_slides} and {validation_slides}"
+        )
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+    slides = [data[offsets[k] : offsets[k + 1]] for k in order]
+    learning = training_slides - validation_slides
+    return BlockData(
+        kind="cube_slides",
+        train=_recordings(slides[:learning]),
+        validation=_recordings(slides[learning:training_slides]),
+        test=_recordings(slides[training_slides:]),
+        test_long=None,
+        dt=dt,
+        gravity=float(_scalar(path, "g", arrays["g"])),
+        mass=float(_scalar(path, "mass_kg", arrays["mass_kg"])),
+        mu=None,
+    )
+
+
+def _scalar(path: Path, name: str, value: NDArray) -> NDArray:
+    if value.size != 1 or value.dtype.kind != "f" or not value.item() > 0:
+        raise ValueError(f"{path}: {name}: expected one positive number, got {value}")
+    return value
+
+
+def _recordings(slides: list[NDArray]) -> Recordings:
+    """Pad at the end with the last position and velocity."""
+    instants = max(len(slide) for slide in slides)
+    padded = torch.from_numpy(
+        np.stack([np.pad(slide, ((0, instants - len(slide)), (0, 0)), mode="edge") for slide in slides])
+    ).to(torch.float64)
+    return Recordings(
+        positions=padded[..., COLUMNS.index("s_m")].contiguous(),
+        velocities=padded[..., COLUMNS.index("v_m_s")].contiguous(),
+        forces=torch.zeros(len(slides), instants - 1, dtype=torch.float64),
+        friction=None,
+        steps=torch.tensor([len(slide) - 1 for slide in slides]),
+        true_velocities=None,
+    )

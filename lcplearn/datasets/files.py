@@ -1,0 +1,74 @@
+"""Find and open data files; what is wrong with one is said in one sentence."""
+
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def find(name: str) -> Path:
+    """Path of a data file, in the folder named by LCPLEARN_DATA or else in data/.
+
+    Raises:
+        FileNotFoundError: It is not there.
+    """
+    path = Path(os.environ.get("LCPLEARN_DATA") or "data") / name
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path}: no such file; data/README.md has the command that makes it, and LCPLEARN_DATA can name its folder"
+        )
+    return path
+
+
+def read_npz(path: Path | str, keys: tuple[str, ...]) -> dict[str, NDArray]:
+    """Arrays of an NPZ file, without ever running a pickle.
+
+    Args:
+        path: The file.
+        keys: Names of the arrays that it must hold.
+
+    Returns:
+        These arrays by name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not an NPZ file, is pickled, lacks an array, or numbers in it are not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: expected an NPZ file (a zip of arrays), got something else; pickles are not read")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            missing = [key for key in keys if key not in file]
+            if missing:
+                raise ValueError(f"expected the arrays {', '.join(keys)}, {', '.join(missing)} missing")
+            arrays = {key: file[key] for key in keys}
+    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+        reason = "arrays of Python objects (pickles) are not read" if "allow_pickle" in str(error) else error
+        raise ValueError(f"{path}: {reason}") from None
+    for key, array in arrays.items():
+        if array.dtype.kind not in "fiuU":
+            raise ValueError(f"{path}: {key}: expected numbers or text, got {array.dtype}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{path}: {key}: {int((~np.isfinite(array)).sum())} values are NaN or infinite")
+    return arrays
+
+
+def check_offsets(path: Path | str, offsets: NDArray, rows: int) -> None:
+    """Require that record k is rows offsets[k]:offsets[k + 1], that each has two rows or more and that all are used.
+
+    Raises:
+        ValueError: They are not so.
+    """
+    if offsets.ndim != 1 or len(offsets) < 2 or offsets.dtype.kind not in "iu":
+        raise ValueError(f"{path}: offsets: expected at least two integers, got {offsets.dtype} {list(offsets.shape)}")
+    if offsets[0] != 0 or offsets[-1] != rows:
+        raise ValueError(f"{path}: offsets: expected 0 to {rows}, the rows of data, got {offsets[0]} to {offsets[-1]}")
+    lengths = np.diff(offsets.astype(np.int64))
+    if (lengths < 2).any():
+        k = int(np.argmax(lengths < 2))
+        raise ValueError(f"{path}: offsets: record {k} has {lengths[k]} rows, expected at least 2")

@@ -1,0 +1,265 @@
+"""Simulated recordings: nothing to download, and the truth is known."""
+
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from lcplearn.datasets.recordings import BlockData, Recordings
+from lcplearn.scenes.falling_block import FallingBlock
+from lcplearn.scenes.sliding_block import SlidingBlock
+
+FrictionLabels = Literal["physical", "lcp", "slack", "measured_slack"]
+
+_SPLITS = ("train", "validation", "test", "test_long")
+_FORCE_PER_LIMIT = 1.2  # standard deviation of the force over mu m g: the block rests 39-45 % of the time
+
+
+class _Draws(NamedTuple):
+    """Random numbers of one split, before any physical scale."""
+
+    start: Float[Tensor, "N"]
+    force: Float[Tensor, "N T"]
+    noise: Float[Tensor, "N T+1"]
+
+
+def simulate_sliding_block(
+    *,
+    seed: int = 0,
+    trajectories: int = 20,
+    length: int = 100,
+    validation_trajectories: int = 10,
+    test_trajectories: int = 40,
+    test_length: int = 100,
+    long_trajectories: int = 20,
+    long_length: int = 1000,
+    dt: float = 0.05,
+    mu: float = 0.4,
+    mass: float = 1.5,
+    gravity: float = 9.81,
+    noise: float = 0.0,
+    friction: FrictionLabels | None = None,
+    force_std: float | None = None,
+    switch_probability: float = 0.1,
+    jitter: float = 0.05,
+    initial_speed: float = 1.0,
+    share_from_rest: float = 0.5,
+    share_at_rest: float | None = None,
+) -> BlockData:
+    """Record a block pushed to and fro on a table with dry friction.
+
+    v_{k+1} = S(v_k + u_{k+1} dt/m, mu g dt), measured with noise N(0, noise^2).
+
+    The force keeps a level drawn from N(0, force_std^2), changes it with switch_probability at each step, and has
+    independent noise of jitter * force_std on top. test and test_long have no measurement noise.
+
+    Args:
+        seed: Seed; the splits draw independently, so that the size of one does not change another.
+        trajectories: Training trajectories.
+        length: Steps of a training or validation trajectory.
+        validation_trajectories: Validation trajectories.
+        test_trajectories: Trajectories for one-step errors.
+        test_length: Steps of each of them.
+        long_trajectories: Trajectories for long rollouts.
+        long_length: Steps of each of them.
+        dt: Step size [s]; > 0.
+        mu: Friction coefficient; >= 0.
+        mass: Mass [kg]; > 0.
+        gravity: Gravitational acceleration [m/s^2].
+        noise: Standard deviation of the measured velocity [m/s].
+        friction: Kind of friction labels, see `friction_labels`; None for none. Labels are free of noise.
+        force_std: Standard deviation of the force level [N]; None for 1.2 mu m g.
+        switch_probability: Probability that the force changes its level at a step.
+        jitter: Standard deviation of the force around its level, over force_std.
+        initial_speed: Standard deviation of the velocity at the start [m/s].
+        share_from_rest: Share of the trajectories that start at rest, rounded to whole ones.
+        share_at_rest: Share of the time that the training trajectories are to be at rest; sets force_std by
+            bisection, as closely as the drawn forces allow. None to leave it to force_std.
+
+    Returns:
+        The recordings and the truth; positions start at 0.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    sizes = [(trajectories, length), (validation_trajectories, length)]
+    sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
+    _check_sizes(sizes, noise)
+    for name, share in (("switch_probability", switch_probability), ("share_from_rest", share_from_rest)):
+        if not 0 <= share <= 1:
+            raise ValueError(f"{name}: expected between 0 and 1, got {share}")
+    if not mu >= 0:
+        raise ValueError(f"mu: expected at least 0, got {mu}")
+    if friction is not None and friction not in get_args(FrictionLabels):
+        raise ValueError(f"friction: expected one of {', '.join(get_args(FrictionLabels))}, got {friction!r}")
+    block = SlidingBlock(mass=mass, mu=mu, dt=dt, gravity=gravity)
+    draws = []
+    for split, (count, steps) in enumerate(sizes):
+        draw = _draw(_generator(seed, split), count, steps, switch_probability, jitter)
+        moving = torch.arange(count) >= round(share_from_rest * count)
+        draws.append(draw._replace(start=draw.start * initial_speed * moving))
+    force_std = _force_std(block, draws[0], force_std, share_at_rest)
+    recordings = {}
+    for name, draw in zip(_SPLITS, draws, strict=True):
+        forces = force_std * draw.force
+        velocities = _slide(block, draw.start, forces)
+        measured = velocities + (noise if name in ("train", "validation") else 0.0) * draw.noise
+        moved = torch.nn.functional.pad(dt * velocities[:, 1:].cumsum(dim=1), (1, 0))
+        labels = None if friction is None else friction_labels(block, velocities[:, :-1], forces, friction)
+        recordings[name] = Recordings(moved, measured, forces, labels, _full_length(forces), velocities)
+    return BlockData(kind="sliding_block", **recordings, dt=dt, gravity=gravity, mass=mass, mu=mu)
+
+
+def friction_labels(
+    block: SlidingBlock, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"], kind: FrictionLabels
+) -> Float[Tensor, "*batch 2"]:
+    """Friction of a step in the pairs that the notes' learning problems take as known.
+
+    With F the physical friction force on the block and lambda-', lambda+' the slacks of the direct LCP:
+
+    physical:        (max(F, 0), max(-F, 0))
+    lcp:             (lambda+, lambda-) = (mu m g - lambda+', mu m g - lambda-'), one of them fictitious in motion
+    slack:           (lambda-', lambda+')
+    measured_slack:  (mu m g - max(-F, 0), mu m g - max(F, 0))
+
+    lcp fits the affine law of 3.1.1 and slack that of 3.1.2; physical and measured_slack are what could be measured,
+    and fit neither.
+
+    Args:
+        block: The block.
+        velocity: Velocity before the step [m/s].
+        force: External force [N].
+        kind: Which pair.
+
+    Returns:
+        The pair [N].
+
+    Source: LCP Notes 3.1.1, 3.1.2; errata 16 and 20.
+    """
+    limit = block.mu * block.mass * block.gravity
+    if kind in ("lcp", "slack"):
+        slack = torch.relu(SlidingBlock(block.mass, block.mu, block.dt, block.gravity).lcp(velocity, force)[1])
+        return slack if kind == "slack" else (limit - slack).flip(-1)
+    acting = (block.closed_form(velocity, force) - velocity) * block.mass / block.dt - force
+    if kind == "physical":
+        return torch.stack((torch.relu(acting), torch.relu(-acting)), dim=-1)
+    return torch.stack((limit - torch.relu(-acting), limit - torch.relu(acting)), dim=-1)
+
+
+def simulate_falling_block(
+    *,
+    seed: int = 0,
+    trajectories: int = 40,
+    length: int = 50,
+    validation_trajectories: int = 10,
+    test_trajectories: int = 40,
+    test_length: int = 50,
+    long_trajectories: int = 20,
+    long_length: int = 200,
+    dt: float = 0.02,
+    mass: float = 1.0,
+    gravity: float = 9.81,
+    noise: float = 0.0,
+    initial_height: float = 1.0,
+    initial_speed: float = 1.0,
+) -> BlockData:
+    """Record a block dropped onto the ground, where it stays.
+
+    The start is drawn from N(0, initial_speed^2) for the velocity and uniformly up to initial_height for the gap; no
+    force acts but gravity and contact. Only the velocity has measurement noise.
+
+    Args:
+        seed: Seed; the splits draw independently.
+        trajectories: Training trajectories.
+        length: Steps of a training or validation trajectory.
+        validation_trajectories: Validation trajectories.
+        test_trajectories: Trajectories for one-step errors.
+        test_length: Steps of each of them.
+        long_trajectories: Trajectories for long rollouts.
+        long_length: Steps of each of them.
+        dt: Step size [s]; > 0.
+        mass: Mass [kg]; > 0.
+        gravity: Gravitational acceleration [m/s^2].
+        noise: Standard deviation of the measured velocity [m/s].
+        initial_height: Largest gap at the start [m].
+        initial_speed: Standard deviation of the velocity at the start [m/s].
+
+    Returns:
+        The recordings and the truth; positions are gaps, mu is None.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    sizes = [(trajectories, length), (validation_trajectories, length)]
+    sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
+    _check_sizes(sizes, noise)
+    block = FallingBlock(mass=mass, dt=dt, gravity=gravity)
+    recordings = {}
+    for split, (name, (count, steps)) in enumerate(zip(_SPLITS, sizes, strict=True)):
+        generator = _generator(seed, split)
+        height = initial_height * torch.rand(count, generator=generator, dtype=torch.float64)
+        speed = initial_speed * torch.randn(count, generator=generator, dtype=torch.float64)
+        forces = torch.zeros(count, steps, dtype=torch.float64)
+        path = block.rollout(torch.stack((height, speed), dim=-1), forces.unsqueeze(-1))
+        velocities = path.velocities.squeeze(-1)
+        error = torch.randn(velocities.shape, generator=generator, dtype=torch.float64)
+        measured = velocities + (noise if name in ("train", "validation") else 0.0) * error
+        gaps = path.positions.squeeze(-1)
+        recordings[name] = Recordings(gaps, measured, forces, None, _full_length(forces), velocities)
+    return BlockData(kind="falling_block", **recordings, dt=dt, gravity=gravity, mass=mass, mu=None)
+
+
+def _generator(seed: int, split: int) -> Generator:
+    return torch.Generator().manual_seed(len(_SPLITS) * seed + split)
+
+
+def _draw(generator: Generator, count: int, steps: int, switch_probability: float, jitter: float) -> _Draws:
+    def normal(columns: int) -> Tensor:
+        return torch.randn(count, columns, generator=generator, dtype=torch.float64)
+
+    levels = normal(steps)
+    switch = torch.rand(count, steps, generator=generator, dtype=torch.float64) < switch_probability
+    switch[:, 0] = True
+    # each step takes the level drawn at the last switch before it
+    last = torch.where(switch, torch.arange(steps), 0).cummax(dim=1).values
+    force = levels.gather(1, last) + jitter * normal(steps)
+    return _Draws(start=normal(1)[:, 0], force=force, noise=normal(steps + 1))
+
+
+def _slide(block: SlidingBlock, start: Float[Tensor, "N"], forces: Float[Tensor, "N T"]) -> Float[Tensor, "N T+1"]:
+    velocities = [start]
+    for force in forces.unbind(1):
+        velocities.append(block.closed_form(velocities[-1], force))
+    return torch.stack(velocities, dim=1)
+
+
+def _force_std(block: SlidingBlock, draws: _Draws, force_std: float | None, share_at_rest: float | None) -> float:
+    limit = float(block.mu * block.mass * block.gravity)
+    if share_at_rest is None:
+        if force_std is None and limit == 0:
+            raise ValueError("force_std: expected a number [N] where mu is 0, got None")
+        return _FORCE_PER_LIMIT * limit if force_std is None else force_std
+    if force_std is not None or not 0 < share_at_rest < 1 or limit == 0:
+        raise ValueError(
+            "share_at_rest: expected between 0 and 1, with mu > 0 and without force_std, "
+            f"got {share_at_rest} with mu = {block.mu} and force_std = {force_std}"
+        )
+    low, high = -3.0, 3.0  # log10(force_std / limit): always at rest in the end, never at rest
+    for _ in range(30):
+        middle = (low + high) / 2
+        at_rest = _slide(block, draws.start, limit * 10**middle * draws.force)[:, 1:] == 0
+        low, high = (middle, high) if at_rest.double().mean() > share_at_rest else (low, middle)
+    return limit * 10**low
+
+
+def _check_sizes(sizes: list[tuple[int, int]], noise: float) -> None:
+    for name, (count, steps) in zip(_SPLITS, sizes, strict=True):
+        if count < 1 or steps < 1:
+            raise ValueError(f"{name}: expected at least 1 trajectory of 1 step, got {count} of {steps}")
+    if not noise >= 0:
+        raise ValueError(f"noise: expected at least 0, got {noise}")
+
+
+def _full_length(forces: Tensor) -> Tensor:
+    return torch.full((forces.shape[0],), forces.shape[1])
