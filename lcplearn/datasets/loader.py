@@ -1,5 +1,6 @@
 """Batches of windows straight from memory: for data this small a DataLoader costs more than the training step."""
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -63,12 +64,18 @@ class WindowLoader:
     def __len__(self) -> int:
         """Number of batches of this rank in an epoch."""
         shard = self._shard_size()
-        return -(-shard // (self.batch_size or shard))
+        return math.ceil(shard / (self.batch_size or shard))
 
     def __iter__(self) -> Iterator[Windows]:
         shard = self._shard()
+        velocity, force, friction, valid = self.windows
         for indices in shard.split(self.batch_size or len(shard)):
-            yield Windows(*(None if field is None else field[indices] for field in self.windows))
+            yield Windows(
+                velocity=velocity[indices],
+                force=force[indices],
+                friction=None if friction is None else friction[indices],
+                valid=valid[indices],
+            )
 
     def _ranks(self) -> tuple[int, int]:
         # Asked for at each epoch: Lightning starts the process group after the loader is built.
@@ -78,7 +85,7 @@ class WindowLoader:
         return (torch.distributed.get_rank(), torch.distributed.get_world_size()) if distributed else (0, 1)
 
     def _shard_size(self) -> int:
-        return -(-self.windows.velocity.shape[0] // self._ranks()[1])
+        return math.ceil(self.windows.velocity.shape[0] / self._ranks()[1])
 
     def _shard(self) -> Tensor:
         count = self.windows.velocity.shape[0]

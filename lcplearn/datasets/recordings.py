@@ -26,7 +26,7 @@ class Recordings(NamedTuple):
     velocities: Float[Tensor, "N T+1"]
     forces: Float[Tensor, "N T"]
     friction: Float[Tensor, "N T 2"] | None
-    steps: Int[Tensor, "N"]
+    steps: Int[Tensor, " N"]
     true_velocities: Float[Tensor, "N T+1"] | None
 
 

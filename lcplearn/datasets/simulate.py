@@ -19,7 +19,7 @@ _FORCE_PER_LIMIT = 1.2  # standard deviation of the force over mu m g: the block
 class _Draws(NamedTuple):
     """Random numbers of one split, before any physical scale."""
 
-    start: Float[Tensor, "N"]
+    start: Float[Tensor, " N"]
     force: Float[Tensor, "N T"]
     noise: Float[Tensor, "N T+1"]
 
@@ -227,7 +227,7 @@ def _draw(generator: Generator, count: int, steps: int, switch_probability: floa
     return _Draws(start=normal(1)[:, 0], force=force, noise=normal(steps + 1))
 
 
-def _slide(block: SlidingBlock, start: Float[Tensor, "N"], forces: Float[Tensor, "N T"]) -> Float[Tensor, "N T+1"]:
+def _slide(block: SlidingBlock, start: Float[Tensor, " N"], forces: Float[Tensor, "N T"]) -> Float[Tensor, "N T+1"]:
     velocities = [start]
     for force in forces.unbind(1):
         velocities.append(block.closed_form(velocities[-1], force))
