@@ -1,0 +1,1 @@
+"""Speed against error: seeded problems, solvers and scenes side by side."""

@@ -1,0 +1,744 @@
+"""Solve LCPs one after the other on the CPU by pivoting; a serial numba kernel.
+
+    find z with 0 <= z, w = M z + q >= 0, z.w = 0
+
+Each element runs down a cascade until its residual, recomputed from the original data, is within tolerance:
+
+1. symmetric Ruiz equilibration, rounded to powers of two so that the scaled data are exact: S = E M E, p = E q / s;
+2. block principal pivoting (Newton-min with Kostreva's single-pivot safeguard) from p < 0 or an initial basis;
+3. Lemke's method with the lexicographic rule on the condensed tableau, with several pivot tolerances and covering
+   vectors (the tolerance has the size of the data's precision: below it a pivot is rounding noise);
+4. a phase-one simplex method, whose optimum proves infeasibility;
+5. a primal-dual interior point, for problems on which pivoting takes exponentially many steps.
+
+Every stage ends with refinement from the data at its basis. Arrays are plain numpy. Everything that numba compiles is
+in this one file because its cache watches only the file of the function; the kernel is serial and releases the GIL.
+
+Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992), chapter 4; Judice and Pires (1994) for
+block pivoting; Mehrotra (1992) for the predictor-corrector steps; Ruiz (2001) for the scaling.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+RUIZ_SWEEPS = 4  # as in residuals.py
+EPS = 2.220446049250313e-16
+SOLVED, INFEASIBLE, UNSOLVED, MAX_ITERATIONS, NONFINITE_INPUT = 0, 1, 2, 3, 4  # solution.Status, as plain constants
+DONE, STUCK, CAPPED = 0, 1, 2  # how a stage ended
+_EXPONENT = 0x7FF0000000000000  # bits of a double that remain when it is rounded down to a power of two
+_LEMKE_TRIES = 3
+_OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    # no nnan and no ninf: tests for convergence rely on comparisons with NaN
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+}
+
+
+def _jit(function: Callable[..., Any]) -> Any:
+    """numba.njit with a cache, or without one where no cache folder can be written."""
+    try:
+        return numba.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # "cannot cache function: no locator available"
+        return numba.njit(**_OPTIONS)(function)
+
+
+class PivotingResult(NamedTuple):
+    """Arrays of `solve_batch`; the fields mean what they mean in `LCPSolution`."""
+
+    z: np.ndarray  # float64 [B, n], zero off the basis
+    w: np.ndarray  # float64 [B, n], zero on the basis
+    basis: np.ndarray  # bool [B, n]
+    residual: np.ndarray  # float64 [B]
+    status: np.ndarray  # int64 [B]
+    iterations: np.ndarray  # int64 [B]
+    certificate: np.ndarray  # float64 [B, n], zero unless INFEASIBLE
+
+
+def solve_batch(
+    M: np.ndarray,
+    q: np.ndarray,
+    *,
+    single_precision: bool,
+    max_iter: int | None,
+    tol: float | None = None,
+    initial_basis: np.ndarray | None = None,
+) -> PivotingResult:
+    """Solve B LCPs; each element's result is independent of its neighbours, bit by bit.
+
+    Args:
+        M: float64 [B, n, n], or [1, n, n] shared by the batch; C-contiguous; never written to.
+        q: float64 [B, n], or [1, n] shared by the batch; likewise.
+        single_precision: the data were rounded to float32, so pivots below 1e-6 are noise and the tolerance is 2e-6.
+        max_iter: pivots and interior-point steps allowed to an element; None lets each stage choose.
+        tol: largest residual that is SOLVED; None is 1e-10, or 2e-6 for single precision.
+        initial_basis: bool [B, n], where block pivoting starts.
+
+    Status:
+        SOLVED, INFEASIBLE (with certificate), UNSOLVED, MAX_ITERATIONS, NONFINITE_INPUT (z and w are NaN).
+
+    Cost: O(n^3) per principal block, O(n^2) per Lemke pivot; memory O(B n + n^2).
+    """
+    n = q.shape[-1]
+    B = min(M.shape[0], q.shape[0]) and max(M.shape[0], q.shape[0])
+    z, w = np.empty((B, n)), np.empty((B, n))
+    basis = np.empty((B, n), dtype=np.bool_)
+    if initial_basis is not None:
+        basis[...] = initial_basis
+    residual = np.zeros(B)
+    status, iterations = np.zeros(B, dtype=np.int64), np.zeros(B, dtype=np.int64)
+    certificate = np.zeros((B, n))
+    result = PivotingResult(z, w, basis, residual, status, iterations, certificate)
+    if B == 0 or n == 0:
+        return result
+    if tol is None:
+        tol = 2e-6 if single_precision else 1e-10
+    _announce_compilation()
+    # numba compiles a second kernel for read-only arrays; they are rare (torch gives none), so copy instead
+    M = M if M.flags.writeable else M.copy()
+    q = q if q.flags.writeable else q.copy()
+    budget = -1 if max_iter is None else max_iter
+    _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, *result)
+    return result
+
+
+def solve_adjoint(
+    M: np.ndarray,
+    z: np.ndarray,
+    basis: np.ndarray,
+    grad_z: np.ndarray,
+    grad_w: np.ndarray,
+    solved: np.ndarray,
+    need_M: bool,
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Gradients of a scalar with respect to M and q from those with respect to z and w, at the basis A.
+
+    z_A = -M_AA^-1 q_A and w_I = M_IA z_A + q_I, so with M_AA' y_A = -(grad_z_A + M_IA' grad_w_I) and y_I = grad_w_I
+
+        grad_q = y,   grad_M = y z'
+
+    Args:
+        M: float64 [B, n, n] or [1, n, n]; grad_M has its shape, and for a shared M it is the sum over the batch.
+        z, grad_z, grad_w: float64 [B, n]; basis: bool [B, n].
+        solved: bool [B]; the other elements get zero gradients.
+        need_M: whether grad_M is wanted; else None is returned for it.
+
+    Returns:
+        grad_M (or None) and grad_q [B, n]. Where M_AA is singular (redundant contacts, and the solver ended on an
+        interior point), y solves the consistent part of the equations: the gradient of unique quantities is exact.
+    """
+    grad_q = np.zeros(z.shape)
+    grad_M = np.zeros(M.shape if need_M else (0, 0, 0))
+    if grad_q.size:
+        M = M if M.flags.writeable else M.copy()
+        _adjoint_range(M, z, basis, grad_z, grad_w, solved, grad_M, grad_q)
+    return (grad_M if need_M else None), grad_q
+
+
+def _announce_compilation() -> None:
+    """Say once, on a terminal, that the first solve on this machine compiles."""
+    if _solve_range.signatures or not sys.stderr.isatty():
+        return
+    folder = getattr(_solve_range.stats, "cache_path", None)
+    name = os.path.basename(__file__).removesuffix(".py") + "._solve_range"
+    cached = folder is not None and os.path.isdir(folder) and any(f.startswith(name) for f in os.listdir(folder))
+    if not cached:
+        sys.stderr.write("lcplearn: compiling the LCP kernel, once per machine (10-20 s)\n")
+
+
+# --- linear algebra -------------------------------------------------------------------------------------------------
+
+
+@_jit
+def _factor(A, k, rows, cols, threshold, complete):
+    """LU of A[:k, :k] in place with partial or complete pivoting; the number of pivots above the threshold."""
+    for c in range(k):
+        cols[c] = c
+    for c in range(k):
+        row, column, largest = c, c, abs(A[c, c])
+        last = k if complete else c + 1
+        for i in range(c, k):
+            for j in range(c, last):
+                if abs(A[i, j]) > largest:
+                    row, column, largest = i, j, abs(A[i, j])
+        if not largest > threshold:
+            return c
+        rows[c] = row
+        if row != c:
+            for j in range(k):
+                A[c, j], A[row, j] = A[row, j], A[c, j]
+        if column != c:
+            cols[c], cols[column] = cols[column], cols[c]
+            for i in range(k):
+                A[i, c], A[i, column] = A[i, column], A[i, c]
+        inverse = 1.0 / A[c, c]
+        for i in range(c + 1, k):
+            factor = A[i, c] * inverse
+            A[i, c] = factor
+            if factor != 0.0:
+                for j in range(c + 1, k):
+                    A[i, j] -= factor * A[c, j]
+    return k
+
+
+@_jit
+def _solve(A, k, rank, rows, cols, x, scratch):
+    """Solve with the factors of `_factor`, x in place; beyond the rank the unknowns are zero."""
+    for c in range(rank):
+        x[c], x[rows[c]] = x[rows[c]], x[c]
+    for i in range(1, rank):
+        total = 0.0
+        for j in range(i):
+            total += A[i, j] * x[j]
+        x[i] -= total
+    for i in range(rank - 1, -1, -1):
+        total = 0.0
+        for j in range(i + 1, rank):
+            total += A[i, j] * x[j]
+        x[i] = (x[i] - total) / A[i, i]
+    for c in range(k):
+        scratch[cols[c]] = x[c] if c < rank else 0.0
+    x[:k] = scratch[:k]
+
+
+@_jit
+def _gather(S, basis, A, index):
+    """Copy S_AA to A and A's members to index; its size."""
+    n = S.shape[0]
+    k = 0
+    for i in range(n):
+        if basis[i]:
+            index[k] = i
+            k += 1
+    for a in range(k):
+        for b in range(k):
+            A[a, b] = S[index[a], index[b]]
+    return k
+
+
+# --- scaling and judgement ------------------------------------------------------------------------------------------
+
+
+@_jit
+def _all_finite(x):
+    """Whether no entry is NaN or infinite."""
+    bad = 0
+    for i in range(x.size):
+        bad += not abs(x[i]) <= 1.7976931348623157e308
+    return bad == 0
+
+
+@_jit
+def _equilibrate(M, size, largest, d):
+    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; size and largest are scratch."""
+    n = M.shape[0]
+    for i in range(n):
+        d[i] = 1.0
+        for j in range(i + 1):
+            a, b = abs(M[i, j]), abs(M[j, i])
+            size[i, j] = size[j, i] = a if a > b else b
+    for _ in range(RUIZ_SWEEPS):
+        largest[:n] = 0.0
+        for i in range(n):
+            for j in range(n):
+                scaled = size[i, j] * d[i]
+                largest[j] = scaled if scaled > largest[j] else largest[j]
+        change = 0.0
+        for j in range(n):
+            scaled = largest[j] * d[j]
+            if scaled > 0.0:
+                d[j] /= sqrt(max(scaled, 2.2250738585072014e-308))
+                change = max(change, abs(scaled - 1.0))
+        if change < 1e-6:  # further sweeps would move the residual by as little
+            break
+
+
+@_jit
+def _scale(M, q, d, e, S, p):
+    """S = E M E and p = E q / s, without rounding: E and s are powers of two; returns s."""
+    n = q.size
+    e[n] = 0.0
+    bits = e.view(np.int64)
+    for i in range(n):
+        e[i] = d[i]
+        bits[i] &= _EXPONENT
+        e[n] = max(e[n], abs(e[i] * q[i]))
+    bits[n] &= _EXPONENT
+    s = e[n]
+    for i in range(n):
+        p[i] = e[i] * q[i] / s
+        for j in range(n):
+            S[i, j] = e[i] * M[i, j] * e[j]
+    return s
+
+
+@_jit
+def _evaluate(S, p, z, w, omega):
+    """w = S z + p and the size of what was added up, omega = |S| z + |p|."""
+    n = p.size
+    for i in range(n):
+        total, size = p[i], abs(p[i])
+        for j in range(n):
+            term = S[i, j] * z[j]
+            total += term
+            size += abs(term)
+        w[i] = total
+        omega[i] = size
+
+
+@_jit
+def _judge(q, p, d, e, s, z, w, omega, tol):
+    """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
+    n = q.size
+    z_size = 0.0
+    for i in range(n):
+        z_size = max(z_size, e[i] * z[i])
+    natural, q_size, rows, absMz, absq, total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        f = d[i] / e[i]
+        natural = max(natural, abs(min(z[i] / f, w[i] * f)))
+        q_size = max(q_size, f * abs(p[i]))
+        z_share = e[i] * z[i] / z_size if z[i] > 0.0 else 0.0
+        w_share = w[i] / omega[i] if w[i] != 0.0 else 0.0
+        rows = max(rows, abs(min(z_share, w_share)))
+        absMz = max(absMz, (omega[i] - abs(p[i])) / e[i])
+        absq = max(absq, abs(q[i]))
+        total += abs(w[i]) + e[i] * s * z[i]
+    residual = max(natural / q_size, rows)
+    if not total <= 1.7976931348623157e308:
+        residual = np.inf
+    return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))
+
+
+# --- refinement and block pivoting ----------------------------------------------------------------------------------
+
+
+@_jit
+def _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch):
+    """Newton steps on w_A = 0 with the factors of S_AA, from z with its w and omega; then z >= 0."""
+    n = p.size
+    for _ in range(3):
+        worst = 0.0
+        for a in range(k):
+            i = index[a]
+            x[a] = w[i]
+            worst = max(worst, abs(w[i]) / omega[i] if w[i] != 0.0 else 0.0)
+        if not worst > 2.0 * EPS:
+            break
+        _solve(A, k, rank, rows, cols, x, scratch)
+        for a in range(k):
+            z[index[a]] -= x[a]
+        _evaluate(S, p, z, w, omega)
+    negative = False
+    for i in range(n):
+        if z[i] < 0.0:
+            z[i] = 0.0
+            negative = True
+    if negative:
+        _evaluate(S, p, z, w, omega)
+
+
+@_jit
+def _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch):
+    """Refine z on the basis from the data; a singular S_AA gives a basic solution of the consistent equations."""
+    n = p.size
+    for i in range(n):
+        z[i] = z[i] if basis[i] else 0.0
+    _evaluate(S, p, z, w, omega)
+    k = _gather(S, basis, A, index)
+    rank = _factor(A, k, rows, cols, 4.0 * n * EPS, False)
+    if rank < k:
+        _gather(S, basis, A, index)
+        rank = _factor(A, k, rows, cols, 1e-11, True)
+    _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch)
+
+
+@_jit
+def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, cap):
+    """Flip all infeasible members of the basis at a time, from the given one; how it ended and the rounds."""
+    n = p.size
+    fewest, patience = n + 1, 4
+    for iteration in range(cap):
+        k = _gather(S, basis, A, index)
+        rank = _factor(A, k, rows, cols, 16.0 * EPS, False)
+        if rank < k:
+            return STUCK, iteration
+        for a in range(k):
+            x[a] = -p[index[a]]
+        _solve(A, k, rank, rows, cols, x, scratch)
+        z[:] = 0.0
+        z_size = 0.0
+        for a in range(k):
+            z[index[a]] = x[a]
+            z_size = max(z_size, abs(x[a]))
+        _evaluate(S, p, z, w, omega)
+        count, last = 0, -1
+        for i in range(n):
+            if z[i] < -8.0 * EPS * z_size if basis[i] else w[i] < -8.0 * EPS * omega[i]:
+                count += 1
+                last = i
+        if count == 0:
+            _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch)
+            return DONE, iteration + 1
+        if count < fewest:
+            fewest, patience = count, 4
+        else:
+            patience -= 1
+        if patience < 0:  # Kostreva: single flips of the last one end for every P-matrix
+            basis[last] = not basis[last]
+            continue
+        for i in range(n):
+            if z[i] < -8.0 * EPS * z_size if basis[i] else w[i] < -8.0 * EPS * omega[i]:
+                basis[i] = not basis[i]
+    return CAPPED, cap
+
+
+# --- the condensed tableau ------------------------------------------------------------------------------------------
+#
+# Row i says: basic variable = T[i, n + 1] + sum_c T[i, c] * (nonbasic variable of column c), n + 1 columns. Variables
+# are w_i (number i), z_i (n + i) and the covering variable z_0 (2 n), with w = p + S z + cover z_0 at the start.
+# place[variable] is its row, or -1 - column. In the full tableau of the textbooks the column of a nonbasic variable
+# is -T[:, c] and that of a basic one a unit vector, so the lexicographic rule needs nothing else.
+
+
+@_jit
+def _start_tableau(S, p, cover, T, basic, column, place, buffer):
+    """Dictionary at w = p + S z + cover z_0, with z_0 already exchanged for the lexicographically smallest row."""
+    n = p.size
+    row, smallest = 0, np.inf
+    for i in range(n):
+        for j in range(n):
+            T[i, j] = S[i, j]
+        T[i, n] = cover[i]
+        T[i, n + 1] = p[i]
+        basic[i], column[i] = i, n + i
+        place[i], place[n + i] = i, -1 - i
+        if p[i] / cover[i] <= smallest:  # ties: the last has the smallest row of the identity
+            row, smallest = i, p[i] / cover[i]
+    column[n], place[2 * n] = 2 * n, -1 - n
+    _exchange(T, basic, column, place, row, n, buffer)
+    return row
+
+
+@_jit
+def _exchange(T, basic, column, place, row, c, buffer):
+    """Pivot: the nonbasic variable of column c becomes basic in this row."""
+    n = basic.size
+    inverse = 1.0 / T[row, c]
+    T[row, c] = -1.0
+    for j in range(n + 2):
+        buffer[j] = -inverse * T[row, j]
+        T[row, j] = buffer[j]
+    for i in range(n):
+        factor = T[i, c]
+        if i != row and factor != 0.0:
+            T[i, c] = 0.0
+            for j in range(n + 2):
+                T[i, j] += factor * buffer[j]
+    basic[row], column[c] = column[c], basic[row]
+    place[basic[row]], place[column[c]] = row, -1 - c
+
+
+@_jit
+def _leaving_row(T, basic, place, c, tolerance, ratio, tied):
+    """Row that first reaches zero as the variable of column c grows, by the lexicographic rule; -1 on a ray."""
+    n = basic.size
+    best = np.inf
+    for i in range(n):
+        slope = -T[i, c]
+        ratio[i] = max(T[i, n + 1], 0.0) / slope if slope > tolerance else np.inf
+        best = min(best, ratio[i])
+    if best == np.inf:
+        return -1
+    count = 0
+    for i in range(n):
+        if ratio[i] <= best + 1e-12 * (1.0 + best):
+            if basic[i] == 2 * n:  # z_0 leaves whenever it can: this is the solution
+                return i
+            tied[count] = i
+            count += 1
+    j = 0
+    while count > 1 and j < n:
+        where = place[j]
+        best = np.inf
+        for t in range(count):
+            i = tied[t]
+            ratio[i] = T[i, -1 - where] / T[i, c] if where < 0 else (-1.0 / T[i, c] if where == i else 0.0)
+            best = min(best, ratio[i])
+        kept = 0
+        for t in range(count):
+            if ratio[tied[t]] <= best + 1e-12 * (1.0 + abs(best)):
+                tied[kept] = tied[t]
+                kept += 1
+        count = kept
+        j += 1
+    return tied[0]
+
+
+@_jit
+def _lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, basis, z, cap):
+    """Follow Lemke's path until z_0 leaves; z and basis of the last dictionary, how it ended, and the pivots."""
+    n = p.size
+    row = _start_tableau(S, p, cover, T, basic, column, place, buffer)
+    leaving, pivots, ended = row, 1, CAPPED
+    while pivots < cap:
+        entering = leaving + n if leaving < n else leaving - n
+        c = -1 - place[entering]
+        row = _leaving_row(T, basic, place, c, tolerance, ratio, tied)
+        if row < 0:
+            ended = STUCK
+            break
+        leaving = basic[row]
+        _exchange(T, basic, column, place, row, c, buffer)
+        pivots += 1
+        if leaving == 2 * n:
+            ended = DONE
+            break
+    for i in range(n):
+        basis[i] = place[n + i] >= 0
+        z[i] = max(T[place[n + i], n + 1], 0.0) if basis[i] else 0.0
+    return ended, pivots
+
+
+@_jit
+def _prove_infeasible(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, u, cap):
+    """Minimise z_0 subject to S z + cover z_0 + p >= 0; where the minimum is positive its dual u is Farkas' proof.
+
+    At the optimum z_0 = b + u.w + v.z with u, v >= 0 holds identically in z: S'u = -v <= 0 and p.u = -b < 0.
+    """
+    n = p.size
+    row = _start_tableau(S, p, cover, T, basic, column, place, buffer)
+    u[:] = 0.0
+    for _ in range(cap):
+        row = place[2 * n]
+        c, steepest = -1, -tolerance
+        for j in range(n + 1):
+            if T[row, j] < steepest:
+                c, steepest = j, T[row, j]
+        if c < 0:
+            break
+        leaving = _leaving_row(T, basic, place, c, tolerance, ratio, tied)
+        if leaving < 0 or basic[leaving] == 2 * n:
+            return False
+        _exchange(T, basic, column, place, leaving, c, buffer)
+    for i in range(n):
+        if place[i] < 0:
+            u[i] = max(T[place[2 * n], -1 - place[i]], 0.0)
+    pu, size = 0.0, 0.0
+    for i in range(n):
+        pu += p[i] * u[i]
+        size += abs(p[i]) * u[i]
+    proven = pu <= -1e-9 * size and size > 0.0
+    for j in range(n):
+        total, size = 0.0, 0.0
+        for i in range(n):
+            total += S[i, j] * u[i]
+            size += abs(S[i, j]) * u[i]
+        proven = proven and total <= 1e-12 * size
+    return proven
+
+
+# --- interior point -------------------------------------------------------------------------------------------------
+
+
+@_jit
+def _interior_point(S, p, A, rows, cols, z, w, omega, r, dz, dw, scratch, cap):
+    """Mehrotra predictor-corrector steps from z = w = 1; steps taken. One step length for z and w: S couples them."""
+    n = p.size
+    z[:] = 1.0
+    w[:] = 1.0
+    best, since = np.inf, 0
+    for iteration in range(cap):
+        _evaluate(S, p, z, r, omega)
+        mu, infeasibility = 0.0, 0.0
+        for i in range(n):
+            r[i] -= w[i]
+            mu += z[i] * w[i] / n
+            infeasibility = max(infeasibility, abs(r[i]))
+        merit = max(mu, infeasibility)
+        if not merit > 50.0 * EPS:
+            return iteration
+        since += 1
+        if merit < 0.5 * best:
+            best, since = merit, 0
+        if since > 15:  # stalled
+            return iteration
+        for i in range(n):
+            for j in range(n):
+                A[i, j] = S[i, j]
+            A[i, i] += w[i] / z[i]
+        if _factor(A, n, rows, cols, 0.0, False) < n:
+            return iteration
+        sigma_mu = 0.0
+        for corrector in range(2):
+            # rows: S dz - dw = -r,  w dz + z dw = sigma mu - z w - dz_aff dw_aff
+            for i in range(n):
+                scratch[i] = (sigma_mu - (dz[i] * dw[i] if corrector else 0.0)) / z[i] - w[i]
+                omega[i] = scratch[i] - r[i]
+            _solve(A, n, n, rows, cols, omega, dz)
+            step = np.inf
+            for i in range(n):
+                dz[i] = omega[i]
+                dw[i] = scratch[i] - w[i] / z[i] * dz[i]
+                if dz[i] < 0.0:
+                    step = min(step, -z[i] / dz[i])
+                if dw[i] < 0.0:
+                    step = min(step, -w[i] / dw[i])
+            if corrector == 0:
+                affine = min(1.0, step)
+                mu_affine = 0.0
+                for i in range(n):
+                    mu_affine += (z[i] + affine * dz[i]) * (w[i] + affine * dw[i]) / n
+                sigma_mu = (mu_affine / mu) ** 3 * mu
+        step = min(1.0, max(0.99, 1.0 - mu) * step)
+        if not step > 1e-8:
+            return iteration
+        for i in range(n):
+            z[i] += step * dz[i]
+            w[i] += step * dw[i]
+    return cap
+
+
+# --- the cascade ----------------------------------------------------------------------------------------------------
+
+
+@_jit
+def _covering_vector(attempt, cover):
+    """Ones, and for another attempt an irregular positive vector: another path, without the old ray or cycle."""
+    for i in range(cover.size):
+        cover[i] = 1.0 if attempt != 1 else 1.0 + (0.6180339887498949 * (i + 1)) % 1.0
+
+
+@_jit
+def _lemke_tolerance(attempt, single_precision):
+    """Smallest pivot: the size of the data's precision first."""
+    if single_precision:
+        return 1e-6 if attempt == 0 else (1e-4 if attempt == 1 else 1e-9)
+    return 1e-9 if attempt == 0 else (1e-7 if attempt == 1 else 1e-12)
+
+
+@_jit
+def _solve_range(
+    M, q, tol, single_precision, budget, warm, z_out, w_out, basis_out, residual_out, status_out, iterations_out, u_out
+):
+    """Run the cascade for each element; the outputs are the fields of PivotingResult."""
+    B, n = z_out.shape
+    S, A, T = np.empty((n, n)), np.empty((n, n)), np.empty((n, n + 2))
+    d, e, p, cover = np.empty(n), np.empty(n + 1), np.empty(n), np.empty(n)
+    z, w, omega, x, y, v = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    buffer, basis = np.empty(n + 2), np.empty(n, dtype=np.bool_)
+    rows, cols = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    index, basic = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    column, place = np.empty(n + 1, dtype=np.int64), np.empty(2 * n + 1, dtype=np.int64)
+    for b in range(B):
+        Mb, qb = M[b if M.shape[0] > 1 else 0], q[b if q.shape[0] > 1 else 0]
+        if not (_all_finite(qb) and _all_finite(Mb.ravel())):
+            z_out[b], w_out[b], basis_out[b] = np.nan, np.nan, False
+            residual_out[b], status_out[b] = np.inf, NONFINITE_INPUT
+            continue
+        if qb.min() >= 0.0:
+            z_out[b], w_out[b], basis_out[b] = 0.0, qb, False
+            continue
+        _equilibrate(Mb, T, x, d)
+        s = _scale(Mb, qb, d, e, S, p)
+        for i in range(n):
+            basis[i] = basis_out[b, i] if warm else p[i] < 0.0
+        best, used, status, capped = np.inf, 0, UNSOLVED, False
+        for stage in range(_LEMKE_TRIES + 2):
+            left = budget - used if budget >= 0 else -1
+            if left == 0:
+                capped = True
+                break
+            if stage == 0:
+                cap = 20 if left < 0 else min(20, left)
+                ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, y, cap)
+            elif stage <= _LEMKE_TRIES:
+                _covering_vector(stage - 1, cover)
+                pivot_tol = _lemke_tolerance(stage - 1, single_precision)
+                cap = 10 * n + 50 if left < 0 else left
+                ended, count = _lemke(
+                    S, p, cover, pivot_tol, T, basic, column, place, buffer, x, index, basis, z, cap
+                )
+                capped = capped or ended == CAPPED
+                _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
+            else:
+                cover[:] = 1.0
+                if _prove_infeasible(
+                    S, p, cover, 1e-11, T, basic, column, place, buffer, x, index, v, 20 * n + 50
+                ):
+                    status = INFEASIBLE
+                    u_out[b] = e[:n] * v / (e[:n] * v).max()
+                    break
+                cap = 80 if left < 0 else min(80, left)
+                count = _interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, cap)
+                ended = DONE
+                for i in range(n):
+                    basis[i] = z[i] > w[i]
+                _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
+            used += count
+            if stage == 0 and ended != DONE:
+                continue
+            residual, limit = _judge(qb, p, d, e, s, z, w, omega, tol)
+            if residual < best or best == np.inf:
+                best = residual
+                for i in range(n):
+                    z_out[b, i] = e[i] * s * z[i] if basis[i] else 0.0
+                    w_out[b, i] = 0.0 if basis[i] else max(w[i], 0.0) * s / e[i]
+                    basis_out[b, i] = basis[i]
+            if residual <= limit:
+                status = SOLVED
+                break
+        if best == np.inf and capped:
+            z_out[b], w_out[b], basis_out[b] = 0.0, qb, False
+        if status == UNSOLVED and capped:
+            status = MAX_ITERATIONS
+        residual_out[b], status_out[b], iterations_out[b] = best, status, used
+
+
+@_jit
+def _adjoint_range(M, z, basis, grad_z, grad_w, solved, grad_M, grad_q):
+    """The adjoint of each element; see `solve_adjoint`."""
+    B, n = z.shape
+    A, x, scratch = np.empty((n, n)), np.empty(n), np.empty(n)
+    rows, cols, index = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    for b in range(B):
+        if not solved[b]:
+            continue
+        Mb = M[b if M.shape[0] > 1 else 0]
+        rank = -1
+        for complete in range(2):
+            k = 0
+            for i in range(n):
+                if basis[b, i]:
+                    index[k] = i
+                    k += 1
+            largest = 0.0
+            for a in range(k):
+                for c in range(k):
+                    A[c, a] = Mb[index[a], index[c]]
+                    largest = max(largest, abs(A[c, a]))
+            rank = _factor(A, k, rows, cols, (1e-11 if complete else n * EPS) * largest, complete == 1)
+            if rank == k:
+                break
+        for a in range(k):
+            x[a] = -grad_z[b, index[a]]
+        for i in range(n):
+            if not basis[b, i] and grad_w[b, i] != 0.0:
+                grad_q[b, i] = grad_w[b, i]
+                for a in range(k):
+                    x[a] -= Mb[i, index[a]] * grad_w[b, i]
+        _solve(A, k, rank, rows, cols, x, scratch)
+        for a in range(k):
+            grad_q[b, index[a]] = x[a]
+        if grad_M.shape[0] > 0:
+            m = b if grad_M.shape[0] > 1 else 0
+            for i in range(n):
+                if grad_q[b, i] != 0.0:
+                    for j in range(n):
+                        grad_M[m, i, j] += grad_q[b, i] * z[b, j]
