@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lcplearn.lcp.residuals import RUIZ_SWEEPS
+from lcplearn.lcp.residuals import two_sided_scales
 from lcplearn.lcp.solution import LCPSolution, Status
 
 ForwardSolve = Callable[[Tensor, Tensor, Tensor | None], LCPSolution]
@@ -133,7 +133,7 @@ def _solve_block(K: Tensor, basis: Tensor, rhs: Tensor, pivot_tolerance: float, 
     if K.numel() == 0:
         return torch.zeros_like(rhs)
     block = torch.where(basis.unsqueeze(-1) & basis.unsqueeze(-2), K, 0.0)
-    rows, columns = _two_sided_scales(block)
+    rows, columns = two_sided_scales(block)
     block = rows.unsqueeze(-1) * block * columns.unsqueeze(-2)
     b = torch.where(basis, rows * rhs, 0.0).unsqueeze(-1)
     factors, pivots, _ = torch.linalg.lu_factor_ex(block + torch.diag_embed((~basis).to(K.dtype)))
@@ -144,18 +144,6 @@ def _solve_block(K: Tensor, basis: Tensor, rhs: Tensor, pivot_tolerance: float, 
         least_squares = torch.linalg.pinv(block[singular], rtol=rank_tolerance) @ b[singular]
         x[singular] = least_squares.squeeze(-1)
     return torch.where(basis, columns * x, 0.0)
-
-
-def _two_sided_scales(A: Tensor) -> tuple[Tensor, Tensor]:
-    """Row and column scales that bring the largest entries near 1; a rank decision must not depend on units."""
-    size = A.abs()
-    rows, columns = torch.ones_like(A[..., 0]), torch.ones_like(A[..., 0])
-    for _ in range(RUIZ_SWEEPS):
-        scaled = rows.unsqueeze(-1) * size * columns.unsqueeze(-2)
-        row, column = scaled.amax(-1), scaled.amax(-2)
-        rows = torch.where(row > 0, rows / row.sqrt(), rows)
-        columns = torch.where(column > 0, columns / column.sqrt(), columns)
-    return rows, columns
 
 
 def _batch_first(x: Tensor, dim: int | None, size: int) -> Tensor:

@@ -14,19 +14,21 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lcplearn.lcp.residuals import EPS, equilibrate
+from lcplearn.lcp.residuals import EPS, equilibrate, judge, two_sided_scales
 
 DEFAULT_MAX_ITER = 100
 POLISH_BELOW = 1e-6  # try the basis once the merit is this small: earlier tries fail, later ones waste iterations
 EXACT = 16 * EPS
 CONVERGED = 50 * EPS
-PATIENCE = 15  # iterations within which the merit has to halve
-POLISH_ROUNDS = 3
-RIDGE = 1e-9  # for singular blocks; the refinement rounds take its bias out again
+PATIENCE = 15  # iterations within which the complementarity gap has to halve
+REFINEMENTS = 3
+RIDGE = 1e-9  # for singular blocks; refinement takes its bias out again
+PROXIMAL_WEIGHTS = (0.0, 1e-3, 1e-4, 1e-5, 1e-6, 0.0)
+FLIP_PATIENCE = 4  # rounds of block flips that may fail to lower the number of wrong signs
 
 
 class Iterate(NamedTuple):
-    """Where the method ended, before judgement; `exhausted` marks elements stopped by max_iter alone."""
+    """Where a method ended, before judgement; `exhausted` marks elements stopped by max_iter alone."""
 
     z: Float[Tensor, "b n"]
     w: Float[Tensor, "b n"]
@@ -45,7 +47,7 @@ class _Active:
     tau: Float[Tensor, "b 1"]
     z: Float[Tensor, "b n"]
     w: Float[Tensor, "b n"]
-    best: Float[Tensor, " b"]  # merit when it last halved
+    gap: Float[Tensor, " b"]  # complementarity gap when it last halved
     since: Int[Tensor, " b"]  # iterations since then
 
     def keep(self, mask: Bool[Tensor, " b"]) -> "_Active":
@@ -62,33 +64,63 @@ def interior_point(
     d = torch.exp2(torch.log2(equilibrate(M)).round())
     s = (d * q).abs().amax(-1, keepdim=True).clamp_min(smoothing**0.5)
     s = torch.where(s > 0, torch.exp2(torch.log2(s).round()), 1.0)
-    end = _follow_path(d.unsqueeze(-1) * M * d.unsqueeze(-2), d * q / s, smoothing / s.square(), max_iter)
-    return end._replace(z=end.z * d * s, w=end.w / d * s)
+    S, p, tau = d.unsqueeze(-1) * M * d.unsqueeze(-2), d * q / s, smoothing / s.square()
+    best, iterations, exhausted = _follow_path(S, p, tau, max_iter)
+    for delta in PROXIMAL_WEIGHTS if not smoothing else ():
+        _improve(best, S, p, delta)
+    return Iterate(best.z * d * s, best.w / d * s, best.basis, iterations, exhausted)
 
 
-def _follow_path(S: Tensor, p: Tensor, tau: Tensor, max_iter: int) -> Iterate:
+class _Best(NamedTuple):
+    """Best point so far of each element, by the judge's residual; updated in place."""
+
+    z: Float[Tensor, "b n"]
+    w: Float[Tensor, "b n"]
+    basis: Bool[Tensor, "b n"]
+    error: Float[Tensor, " b"]
+
+    def offer(self, index: Tensor, S: Tensor, p: Tensor, z: Tensor, w: Tensor, basis: Tensor) -> Tensor:
+        """Take points that are better than those held; returns their residual."""
+        z, w = z.clamp_min(0), w.clamp_min(0)
+        error = judge(S, p, z, tol=EXACT).residual
+        better = error < self.error[index]
+        for held, offered in zip(self, (z, w, basis, error), strict=True):
+            held[index[better]] = offered[better]
+        return error
+
+
+def _follow_path(S: Tensor, p: Tensor, tau: Tensor, max_iter: int) -> tuple[_Best, Tensor, Tensor]:
     """Iterate until each element has converged, stalled or run out of iterations."""
-    ones = torch.ones_like(p)
-    counter = torch.zeros(p.shape[0], dtype=torch.int64, device=p.device)
-    end = Iterate(ones.clone(), ones.clone(), ones > 0, counter.clone(), counter > 0)
-    a = _Active(
-        index=torch.arange(p.shape[0], device=p.device), S=S, p=p, tau=tau, z=ones, w=ones,
-        best=torch.full_like(p[:, 0], torch.inf), since=counter,
-    )  # fmt: skip
+    ones, infinite = torch.ones_like(p), torch.full_like(p[:, 0], torch.inf)
+    index = torch.arange(p.shape[0], device=p.device)
+    best = _Best(ones.clone(), ones.clone(), ones > 0, infinite.clone())
+    iterations, exhausted = torch.zeros_like(index), index < 0
+    a = _Active(index, S, p, tau, z=ones, w=ones, gap=infinite, since=iterations.clone())
     for iteration in range(max_iter + 1):
         r = _multiply(a.S, a.z) + a.p - a.w
-        merit = torch.maximum((a.z * a.w - a.tau).abs().amax(-1), r.abs().amax(-1))
-        halved = merit < 0.5 * a.best
-        a.best, a.since = torch.where(halved, merit, a.best), torch.where(halved, 0, a.since + 1)
-        finished = (merit <= CONVERGED) | (a.since > PATIENCE) | ~merit.isfinite()
+        gap = (a.z * a.w - a.tau).abs().amax(-1)
+        merit = torch.maximum(gap, r.abs().amax(-1))
+        halved = gap < 0.5 * a.gap
+        a.gap, a.since = torch.where(halved, gap, a.gap), torch.where(halved, 0, a.since + 1)
+        smoothed = (a.tau > 0).squeeze(-1)
+        finished = (smoothed & (merit <= CONVERGED)) | (a.since > PATIENCE)
+        near = (merit < POLISH_BELOW) & ~smoothed
+        if near.any():
+            c = a.keep(near)
+            finished[near] |= best.offer(c.index, c.S, c.p, *solve_on_basis(c.S, c.p, c.z, c.z > c.w)) <= EXACT
+        z, w = _predict_and_correct(a, r)
+        finished |= ~(z.isfinite() & w.isfinite()).all(-1)
         out_of_time = ~finished & (iteration == max_iter)
-        finished = _store(end, a, finished | out_of_time, merit < POLISH_BELOW, iteration)
-        end.exhausted[a.index] = out_of_time
-        if finished.all():
+        stop = finished | out_of_time
+        if stop.any():
+            c = a.keep(stop)
+            best.offer(c.index, c.S, c.p, c.z, c.w, (c.z > c.w) | (c.tau > 0))
+            iterations[c.index], exhausted[a.index] = iteration, out_of_time
+            a, z, w = a.keep(~stop), z[~stop], w[~stop]
+        if not len(a.index):
             break
-        a, r = a.keep(~finished), r[~finished]
-        a.z, a.w = _predict_and_correct(a, r)
-    return end
+        a.z, a.w = z, w
+    return best, iterations, exhausted
 
 
 def _predict_and_correct(a: _Active, r: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,36 +147,59 @@ def _longest_step(a: _Active, dz: Tensor, dw: Tensor) -> Tensor:
     return 1 / fastest.clamp_min(EPS)
 
 
-def _store(end: Iterate, a: _Active, finished: Tensor, near: Tensor, iteration: int) -> Tensor:
-    """Write finished elements to `end`, polished where that is better; returns which elements are finished."""
-    chosen = finished | (near & (a.tau.squeeze(-1) == 0))
-    if not chosen.any():
-        return finished
-    c = a.keep(chosen)
-    basis = (c.z > c.w) | (c.tau > 0)
-    z, w = polish(c.S, c.p, c.z, basis)
-    error = _natural(c.S, c.p, z)
-    exact = error <= EXACT
-    worse = ((c.tau > 0) | ~(error < _natural(c.S, c.p, c.z)).unsqueeze(-1)) & ~exact.unsqueeze(-1)
-    finished = finished.clone()
-    finished[chosen] |= exact & (c.tau.squeeze(-1) == 0)
-    write = finished[chosen]
-    index = c.index[write]
-    end.z[index] = torch.where(worse, c.z, z)[write]
-    end.w[index] = torch.where(worse, c.w, w)[write]
-    end.basis[index] = basis[write]
-    end.iterations[index] = iteration
-    return finished
+def _improve(best: _Best, S: Tensor, p: Tensor, delta: float) -> None:
+    """Correct the basis of elements that are not solved to rounding yet, in place.
+
+    With delta > 0 on the proximal problem (S + delta I, p - delta z): positive definite where S is semidefinite, so that
+    block pivoting succeeds, and a solution near z that is also one of the original problem in the limit.
+    """
+    rough = torch.nonzero(best.error > EXACT).squeeze(-1)
+    if not len(rough):
+        return
+    S, p, z = S[rough], p[rough], best.z[rough]
+    shifted = _Best(z.clone(), z.clone(), best.basis[rough], torch.full_like(best.error[rough], torch.inf))
+    _correct_basis(S + delta * torch.eye(p.shape[-1], dtype=p.dtype, device=p.device), p - delta * z, shifted)
+    best.offer(rough, S, p, shifted.z, torch.where(shifted.basis, 0.0, _multiply(S, shifted.z) + p), shifted.basis)
+    best.offer(rough, S, p, *solve_on_basis(S, p, shifted.z, shifted.basis))
 
 
-def polish(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve S_AA z_A = -p_A on the basis A, starting from z: exact zeros of z off A and of w on A.
+def _correct_basis(S: Tensor, p: Tensor, best: _Best) -> None:
+    """Improve `best` in place by block principal pivoting from its basis.
+
+    Flips every member with a wrong sign; if that stops lowering their number, only the last one (finite for P-matrices).
+    Source: Judice and Pires, "A block principal pivoting algorithm for large-scale strictly monotone LCPs" (1994).
+    """
+    index = torch.arange(p.shape[0], device=p.device)
+    z, basis = best.z.clone(), best.basis.clone()
+    fewest = torch.full_like(p[:, 0], torch.inf)
+    patience = torch.full_like(index, FLIP_PATIENCE)
+    member = torch.arange(p.shape[-1], device=p.device)
+    for _ in range(3 * p.shape[-1] + 20):
+        z, w, _ = solve_on_basis(S, p, z, basis)
+        error = best.offer(index, S, p, z, w, basis)
+        omega = p.abs() + _multiply(S.abs(), z.abs())
+        wrong = torch.where(basis, z < -8 * EPS * z.abs().amax(-1, keepdim=True), w < -8 * EPS * omega)
+        count = wrong.sum(-1)
+        go_on = (count > 0) & (error > EXACT) & z.isfinite().all(-1)
+        if not go_on.any():
+            break
+        patience = torch.where(count < fewest, FLIP_PATIENCE, patience - 1)
+        fewest = torch.minimum(fewest, count)
+        last = member == torch.where(wrong, member, -1).amax(-1, keepdim=True)
+        basis = basis ^ (wrong & (last | (patience >= 0).unsqueeze(-1)))
+        S, p, z, basis, index, patience, fewest = (x[go_on] for x in (S, p, z, basis, index, patience, fewest))
+
+
+def solve_on_basis(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """z, w and A with S_AA z_A = -p_A on the basis A, starting from z: exact zeros of z off A, of w on A, signs free.
 
     Corrections to the current z rather than a fresh solve: where S_AA is singular (every stick of a friction LCP) they
     leave the part of z in its null space alone and still converge to a consistent solution.
     """
     inside = basis.unsqueeze(-1) & basis.unsqueeze(-2)
-    block = torch.where(inside, S, 0.0) + torch.diag_embed((~basis).to(S.dtype))
+    block = torch.where(inside, S, 0.0)
+    rows, columns = two_sided_scales(block)
+    block = rows.unsqueeze(-1) * block * columns.unsqueeze(-2) + torch.diag_embed((~basis).to(S.dtype))
     factors, pivots, _ = torch.linalg.lu_factor_ex(block)
     diagonal = factors.diagonal(dim1=-2, dim2=-1).abs()
     singular = diagonal.amin(-1) <= 4 * S.shape[-1] * EPS * diagonal.amax(-1)
@@ -152,17 +207,10 @@ def polish(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> tuple[Tensor, Tens
         ridge = RIDGE * singular.to(S.dtype).unsqueeze(-1) * basis
         factors, pivots, _ = torch.linalg.lu_factor_ex(block + torch.diag_embed(ridge))
     z = torch.where(basis, z, 0.0)
-    for _ in range(POLISH_ROUNDS):
-        r = torch.where(basis, _multiply(S, z) + p, 0.0)
-        z = z - torch.linalg.lu_solve(factors, pivots, r.unsqueeze(-1)).squeeze(-1)
-    z = z.clamp_min(0)
-    return z, torch.where(basis, 0.0, (_multiply(S, z) + p).clamp_min(0))
-
-
-def _natural(S: Tensor, p: Tensor, z: Tensor) -> Tensor:
-    """Natural residual max |min(z, S z + p)|; infinity where it is not finite."""
-    error = torch.minimum(z, _multiply(S, z) + p).abs().amax(-1)
-    return torch.where(error.isfinite(), error, torch.inf)
+    for _ in range(REFINEMENTS):
+        r = torch.where(basis, rows * (_multiply(S, z) + p), 0.0)
+        z = z - columns * torch.linalg.lu_solve(factors, pivots, r.unsqueeze(-1)).squeeze(-1)
+    return z, torch.where(basis, 0.0, _multiply(S, z) + p), basis
 
 
 def _multiply(S: Tensor, x: Tensor) -> Tensor:

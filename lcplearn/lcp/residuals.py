@@ -49,6 +49,18 @@ def equilibrate(M: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n"]:
     return d
 
 
+def two_sided_scales(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
+    """Row and column scales r_i A_ij c_j with largest entries near 1: a rank decision must not depend on units."""
+    size = A.abs()
+    rows, columns = torch.ones_like(A[..., 0]), torch.ones_like(A[..., 0])
+    for _ in range(RUIZ_SWEEPS):
+        scaled = rows.unsqueeze(-1) * size * columns.unsqueeze(-2)
+        row, column = scaled.amax(-1), scaled.amax(-2)
+        rows = torch.where(row > 0, rows / row.sqrt(), rows)
+        columns = torch.where(column > 0, columns / column.sqrt(), columns)
+    return rows, columns
+
+
 def smoothed_minimum(a: Tensor, b: Tensor, tau: Tensor | float) -> Tensor:
     """min(a, b), or for tau > 0 the root that is zero where a b = tau, written without cancellation near it."""
     if not isinstance(tau, Tensor) and tau == 0:
