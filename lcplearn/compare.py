@@ -1,0 +1,196 @@
+"""Put runs side by side: python -m lcplearn.compare RUNS...
+
+RUNS are run folders, or folders above them. Runs that differ only in their seed share a row, which shows medians.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import yaml
+from hydra.experimental.callback import Callback
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Value = float | int | None
+# Settings that don't make runs different things to compare.
+_SILENT = ("seed", "data.seed", "ckpt_path", "threads", "logger.", "trainer.")
+_HEADERS = {
+    "velocity_rmse": "one-step [m/s]",
+    "stick_accuracy": "stick",
+    "false_stick": "false stick",
+    "rollout_rmse_100": "100 steps",
+    "rollout_rmse_1000": "1000 steps",
+    "mu_error": "mu error",
+    "mass_error": "mass error",
+    "stop_error_median_mm": "stop [mm]",
+    "stop_error_p90_mm": "stop p90",
+    "rest_share": "at rest",
+    "unsolved_share": "unsolved",
+    "mu": "mu",
+    "parameters": "parameters",
+    "train_seconds": "train [s]",
+    "predict_us": "step [us]",
+}
+
+
+class Row(NamedTuple):
+    """Runs that share all settings but the seed.
+
+    Attributes:
+        label: What sets them apart from the other rows.
+        runs: How many they are.
+        values: Median of each figure; None where no run has it.
+    """
+
+    label: str
+    runs: int
+    values: dict[str, Value]
+
+
+def read_runs(folders: Iterable[str | Path]) -> list[Row]:
+    """Read metrics.json and config.yaml of all runs in or below the folders.
+
+    Raises:
+        ValueError: a folder without a finished run, or a file that can't be read.
+    """
+    paths: list[Path] = []
+    for folder in folders:
+        found = sorted(path.parent for path in Path(folder).rglob("metrics.json"))
+        if not found:
+            raise ValueError(f"{folder} holds no finished run: there is no metrics.json in or below it.")
+        paths += [path for path in found if path not in paths]
+    metrics = [_read(path / "metrics.json", json.loads) for path in paths]
+    configs = [_read(path / "config.yaml", yaml.safe_load) for path in paths]
+    groups: dict[str, list[dict[str, Value]]] = {}
+    for label, values in zip(_labels(configs), metrics, strict=True):
+        groups.setdefault(label, []).append(values)
+    rows = [Row(label, len(runs), _medians(runs)) for label, runs in groups.items()]
+    return sorted(rows, key=lambda row: row.values["stop_error_median_mm"] or row.values["velocity_rmse"] or 1e300)
+
+
+def format_table(rows: Sequence[Row]) -> str:
+    """A markdown table of the figures that any row has."""
+    keys = [key for key in _HEADERS if any(row.values.get(key) is not None for row in rows)]
+    cells = [["run", "seeds", *(_HEADERS[key] for key in keys)]]
+    cells += [[row.label, str(row.runs), *(_number(row.values.get(key)) for key in keys)] for row in rows]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
+
+    def line(texts: Sequence[str]) -> str:
+        padded = [t.ljust(w) if i == 0 else t.rjust(w) for i, (t, w) in enumerate(zip(texts, widths, strict=True))]
+        return "| " + " | ".join(padded) + " |"
+
+    rule = "|" + "|".join("-" * (w + 1) + ("-" if i == 0 else ":") for i, w in enumerate(widths)) + "|"
+    return "\n".join([line(cells[0]), rule, *(line(row) for row in cells[1:])])
+
+
+def draw(rows: Sequence[Row]) -> "Figure":
+    """Accuracy against cost: the error of a step against its time, that of a rollout against the time of training."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    slides = any(row.values.get("stop_error_median_mm") is not None for row in rows)
+    longest = ("rollout_rmse_1000", "rollout_rmse_100")
+    far = "stop_error_median_mm" if slides else next((k for k in longest if any(r.values.get(k) for r in rows)), "")
+    panels = [("predict_us", "velocity_rmse", "time of a step [us]", "error of a step [m/s]")]
+    if far:
+        panels.append(("train_seconds", far, "time of training [s]", far.replace("_", " ")))
+    figure = Figure(figsize=(6.0 * len(panels), 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for ax, (x, y, xlabel, ylabel) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for index, row in enumerate(rows):
+            if row.values.get(x) is None or row.values.get(y) is None:
+                continue
+            # Filled where it sticks: what tells the formulations apart more than any error.
+            sticks = (row.values.get("stick_accuracy") or row.values.get("rest_share") or 0.0) >= 0.98
+            colour = f"C{index % 10}"
+            ax.plot(row.values[x], row.values[y], "o", color=colour, fillstyle="full" if sticks else "none", label=row.label)
+            ax.annotate(row.label, (row.values[x], row.values[y]), xytext=(6, 4), textcoords="offset points", fontsize=8)
+        ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+        ax.margins(0.2)
+        ax.grid(alpha=0.3)
+    figure.suptitle("Accuracy against cost (filled: sticks in at least 98 % of cases; lower left is better)", fontsize=11)
+    return figure
+
+
+class CompareSweep(Callback):
+    """Hydra callback: a sweep ends with the table and the picture of its runs."""
+
+    def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        if any(folder.rglob("metrics.json")):
+            report([folder], folder)
+
+
+def report(folders: Iterable[str | Path], out: str | Path) -> None:
+    """Print the table and write compare.md and compare.png to a folder."""
+    rows, out = read_runs(folders), Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    text = format_table(rows)
+    (out / "compare.md").write_text(text + "\n")
+    draw(rows).savefig(out / "compare.png", dpi=120)
+    print(f"\n{text}\n\n{out / 'compare.png'}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m lcplearn.compare", description=__doc__.split("\n\n")[0])
+    parser.add_argument("runs", nargs="+", metavar="RUNS", help="run folders, or folders above them")
+    parser.add_argument("--out", default=".", help="folder for compare.md and compare.png (default: here)")
+    options = parser.parse_args(arguments)
+    try:
+        report(options.runs, options.out)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
+
+
+def _read(path: Path, parse: Any) -> dict[str, Any]:
+    try:
+        values = parse(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"{path} can't be read: {error}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} holds no settings or figures.")
+    return values
+
+
+def _labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Name of the model's class, and whatever else differs."""
+    flat = [_flatten(config) for config in configs]
+    models = [str(config.get("model._target_", "?")).rpartition(".")[2] for config in flat]
+    labels = []
+    for config, model in zip(flat, models, strict=True):
+        parts = [model]
+        for key in sorted({key for other in flat for key in other}):
+            if key.startswith(_SILENT) or key == "model._target_":
+                continue
+            own = key.startswith("model.")  # arguments of another class are no difference
+            values = [other.get(key) for other, name in zip(flat, models, strict=True) if name == model or not own]
+            if any(value != values[0] for value in values):
+                parts.append(f"{key}={config.get(key)}")
+        labels.append(" ".join(parts))
+    return labels
+
+
+def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _medians(runs: Sequence[Mapping[str, Value]]) -> dict[str, Value]:
+    columns = {key: [run[key] for run in runs if run.get(key) is not None] for key in _HEADERS}
+    return {key: statistics.median(values) if values else None for key, values in columns.items()}
+
+
+def _number(value: Value) -> str:
+    return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""Pictures of a trained model: the one-step map, rollouts against the truth, and the error over the horizon."""
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from lcplearn.formulations import Formulation
+from lcplearn.training.metrics import rollout, truth, valid_steps
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+TRUE, LEARNED = {"color": "black", "linewidth": 2.5, "alpha": 0.35}, {"color": "tab:red", "linewidth": 1.4}
+
+
+def draw(model: Formulation, data: Any) -> dict[str, "Figure"]:
+    """Draw what applies to the data.
+
+    Args:
+        model: The trained model, on the CPU.
+        data: `BlockData`.
+
+    Returns:
+        Figures by name: one_step_map (models without measured friction, where a force acts), rollouts, error.
+    """
+    pictures = {"rollouts": rollouts(model, data), "error_over_horizon": error_over_horizon(model, data)}
+    if not model.needs_friction:
+        pictures["one_step_map"] = one_step_map(model, data)
+    return pictures
+
+
+@torch.no_grad()
+def one_step_map(model: Formulation, data: Any, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3)) -> "Figure":
+    """Velocity after a step against the force, for a few velocities before it, with the true stick band."""
+    figure, axes = _figure(1, 1, (7.0, 4.5))
+    mass, mu = data.mass or 1.0, data.mu if data.mu is not None else model.physical_parameters().get("mu")
+    limit = (mu or 0.3) * mass * data.gravity
+    reach = 2.5 * limit + max(speeds) * mass / data.dt
+    force = torch.linspace(-reach, reach, 801, dtype=torch.float64)
+    ax = axes[0][0]
+    for index, speed in enumerate(speeds):
+        colour = f"C{index}"
+        after = model.next_velocity(torch.full_like(force, speed), force)
+        if data.mu is not None:
+            p, c = speed + force * data.dt / mass, data.mu * data.gravity * data.dt
+            exact = p.sign() * (p.abs() - c).clamp(min=0.0)
+            ax.plot(force, exact, color=colour, linewidth=5, alpha=0.25)
+        ax.plot(force, after, color=colour, linewidth=1.4, label=f"from {speed:+.1f} m/s")
+    if data.mu is not None:
+        ax.axvspan(-limit, limit, color="0.9", zorder=0, label="sticks from rest")
+    ax.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+    ax.set(xlabel="force [N]", ylabel="velocity after the step [m/s]")
+    wide = " (thin) and truth (wide)" if data.mu is not None else ""
+    ax.set_title(f"One-step map: learned{wide}")
+    ax.legend(fontsize=9)
+    return figure
+
+
+def rollouts(model: Formulation, data: Any, count: int = 3) -> "Figure":
+    """Velocity of the first test recordings, predicted from their start, with the shares at rest shaded."""
+    figure, axes = _figure(count, 1, (8.0, 1.9 * count + 0.6))
+    test = _first(data.test, count)
+    _, velocity = rollout(model, test)
+    true = truth(test)
+    for row, ax in enumerate(ax for line in axes for ax in line):
+        steps = int(test.steps[row])
+        time = torch.arange(steps + 1) * data.dt
+        ax.plot(time, true[row, : steps + 1], label="recorded" if data.kind == "cube_slides" else "true", **TRUE)
+        ax.plot(time, _shown(velocity[row, : steps + 1], true[row]), label="rolled out from the start", **LEARNED)
+        still = (velocity[row, 1 : steps + 1].abs() < 1e-12).double()
+        ax.fill_between(time[1:], 0, 1, where=still > 0, transform=ax.get_xaxis_transform(), color="0.88", zorder=0,
+                        label="predicted at rest")
+        ax.set_ylabel("v [m/s]")
+    axes[-1][0].set_xlabel("time [s]")
+    axes[0][0].legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    return figure
+
+
+def error_over_horizon(model: Formulation, data: Any) -> "Figure":
+    """Root mean square and largest error of the velocity against the steps since the start of the rollout."""
+    figure, axes = _figure(1, 1, (7.0, 4.0))
+    recordings = data.test_long if data.test_long is not None else data.test
+    _, velocity = rollout(model, recordings)
+    error = (velocity - truth(recordings))[:, 1:].abs()
+    known = valid_steps(recordings)
+    error = torch.where(known, error, 0.0)
+    rms = (error.square().sum(0) / known.sum(0).clamp(min=1)).sqrt()
+    steps = torch.arange(1, len(rms) + 1)
+    ax = axes[0][0]
+    floor = 1e-17  # exact zeros, which a logarithmic axis can't show
+    ax.plot(steps, error.amax(0).clamp(min=floor), color="0.6", linewidth=1.0, label="largest")
+    ax.plot(steps, rms.clamp(min=floor), label="root mean square", **LEARNED)
+    ax.set(xscale="log", yscale="log", xlabel="steps since the start", ylabel="velocity error [m/s]")
+    ax.set_title(f"Error of {len(error)} rollouts")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=9)
+    return figure
+
+
+def _shown(velocity: Tensor, true: Tensor) -> Tensor:
+    """Hide what has left the picture, so that a diverged rollout doesn't flatten the truth."""
+    reach = 3.0 * true.abs().max().clamp(min=1e-3)
+    return torch.where(velocity.abs() <= reach, velocity, torch.nan)
+
+
+def _first(recordings: Any, count: int) -> Any:
+    return type(recordings)(*(None if field is None else field[:count] for field in recordings))
+
+
+def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", list[list["Axes"]]]:
+    """A figure without pyplot, so that it needs no display and is freed by itself."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False, sharex=False).tolist()

@@ -1,0 +1,205 @@
+"""Train a formulation from Python: data in, figures and checkpoints out."""
+
+import json
+import logging
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import yaml
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch.utils.data import DataLoader
+
+from lcplearn.datasets import BlockData, WindowLoader, windows
+from lcplearn.formulations import Formulation, loss_terms
+from lcplearn.training import figures
+from lcplearn.training.callbacks import EarlyStop, EpochBar, LastCheckpoint, Report
+from lcplearn.training.checkpoint import check_resumable, describe, read
+from lcplearn.training.metrics import evaluate, table
+from lcplearn.training.module import FormulationModule
+from lcplearn.training.optimizer import Optimizer
+
+DEFAULTS = {"precision": "64-true", "accelerator": "cpu", "devices": 1, "enable_model_summary": False}
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """Training was stopped by a signal; `checkpoint` is where it can be resumed."""
+
+    def __init__(self, checkpoint: Path) -> None:
+        super().__init__(f"training stopped; resume with ckpt_path={checkpoint}")
+        self.checkpoint = checkpoint
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a training gave.
+
+    Attributes:
+        model: The model with the parameters that validated best.
+        metrics: Figures on the test data, see `metrics.KEYS`; None on processes other than the first.
+        validation: Smallest validation loss.
+        folder: Folder of the run.
+    """
+
+    model: Formulation
+    metrics: dict[str, float | int | None] | None
+    validation: float
+    folder: Path
+
+
+def fit(
+    model: Formulation,
+    data: BlockData,
+    *,
+    loss: Mapping[str, float] | None = None,
+    horizon: int = 1,
+    epochs: int = 500,
+    batch_size: int | None = None,
+    optimizer: Optimizer | None = None,
+    patience: int | None = 10,
+    folder: str | Path | None = None,
+    ckpt_path: str | Path | None = None,
+    seed: int = 0,
+    logger: Any = None,
+    trainer: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Result:
+    """Train a formulation and judge it on the test data.
+
+    Args:
+        model: What to train; its parameters are changed in place.
+        data: Recordings to learn from.
+        loss: Weights of the loss terms; {"prediction": 1.0} by default.
+        horizon: Steps of a training window; only the rollout loss uses more than one.
+        epochs: Epochs to train at most.
+        batch_size: Windows in a batch; None for the full batch, which is best for these small models.
+        optimizer: Adam alone by default.
+        patience: Validations without improvement after which to stop; None to go on.
+        folder: Where the run is written; a new folder runs/DATE_TIME by default.
+        ckpt_path: Checkpoint to resume from.
+        seed: Seed of the order of the batches.
+        logger: A Lightning logger; none by default.
+        trainer: Further keyword arguments of Lightning's Trainer.
+        settings: What config.yaml shall say, for `lcplearn.compare`; the arguments of this call by default.
+
+    Returns:
+        The model, its figures and the folder with best.ckpt, last.ckpt, metrics.json, config.yaml and pictures.
+
+    Raises:
+        ValueError: loss and model don't fit, a checkpoint that can't be resumed, or a folder that holds a run already.
+        TrainingInterrupted: a signal ended the training.
+    """
+    loss = dict(loss or {"prediction": 1.0})
+    optimizer = optimizer or Optimizer()
+    folder = _new_folder(folder)
+    batches, validation = windows(data.train, horizon), windows(data.validation, horizon)
+    loss_terms(model, type(batches)(*(None if field is None else field[:1] for field in batches)), loss)
+    if ckpt_path is not None:
+        check_resumable(ckpt_path, model, epochs)
+    _quiet()
+    chosen = {"max_epochs": epochs, **DEFAULTS, **(trainer or {})}
+    every = min(chosen.setdefault("check_val_every_n_epoch", 10), epochs)
+    chosen["check_val_every_n_epoch"] = every
+    shuffle = batch_size is not None
+    train_loader = WindowLoader(batches, batch_size=batch_size, shuffle=shuffle, seed=seed)
+    chosen["log_every_n_steps"] = chosen.get("log_every_n_steps") or every * (1 if not shuffle else len(train_loader))
+    best = ModelCheckpoint(folder, "best", monitor="val/loss", enable_version_counter=False)
+    last = LastCheckpoint(folder / "last.ckpt", every)
+    callbacks: list[pl.Callback] = [best, last, Report(data)]
+    if chosen.get("enable_progress_bar", True):
+        callbacks.append(EpochBar())
+    if patience is not None:
+        callbacks.append(EarlyStop("val/loss", patience=patience))
+    lightning_trainer = pl.Trainer(
+        default_root_dir=folder, callbacks=callbacks, logger=logger or False, num_sanity_val_steps=0, **chosen
+    )
+    settings = settings or _settings(model, loss=loss, horizon=horizon, seed=seed, epochs=epochs)
+    if lightning_trainer.is_global_zero:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.yaml").write_text(yaml.safe_dump(dict(settings), sort_keys=False))
+    module = FormulationModule(model, loss=loss, horizon=horizon, optimizer=optimizer)
+    start = time.perf_counter()
+    before = read(ckpt_path)["train_seconds"] if ckpt_path is not None else 0.0
+    validation_loader = DataLoader([validation], batch_size=None)  # type: ignore[arg-type, var-annotated]  # one batch
+    lightning_trainer.fit(module, train_loader, validation_loader, ckpt_path=ckpt_path, weights_only=True)
+    seconds = before + time.perf_counter() - start
+    if last.stopped:
+        raise TrainingInterrupted(last.path)
+    return _finish(lightning_trainer, module, data, folder, seconds)
+
+
+def _finish(
+    trainer: pl.Trainer, module: FormulationModule, data: BlockData, folder: Path, seconds: float
+) -> Result:
+    """Take the best parameters, judge them and write what a run leaves; only the first process writes."""
+    best = trainer.checkpoint_callback
+    validation = float(best.best_model_score) if best.best_model_score is not None else float("nan")
+    model = module.model.cpu().eval()
+    if best.best_model_path:
+        state = read(best.best_model_path, "cpu")["state_dict"]
+        module.load_state_dict(state)
+    if not trainer.is_global_zero:
+        return Result(model, None, validation, folder)
+    metrics = evaluate(model, data, train_seconds=seconds)
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    pictures = figures.draw(model, data)
+    for name, figure in pictures.items():
+        figure.savefig(folder / f"{name}.png", dpi=120)
+    _log_results(trainer, module, metrics, validation, pictures)
+    return Result(model, metrics, validation, folder)
+
+
+def _log_results(
+    trainer: pl.Trainer,
+    module: FormulationModule,
+    metrics: Mapping[str, float | int | None],
+    validation: float,
+    pictures: Mapping[str, Any],
+) -> None:
+    """Hyperparameters, result table and figures for the logger's page."""
+    if trainer.logger is None:
+        return
+    numbers = {f"test/{key}": float(value) for key, value in metrics.items() if value is not None}
+    described = describe(module.model)
+    weights = {f"loss.{name}": weight for name, weight in module.loss.items()}
+    hyperparameters = {"model": described["class"].rpartition(".")[2], "horizon": module.horizon} | weights
+    hyperparameters |= described["arguments"]
+    writer = getattr(trainer.logger, "experiment", None)
+    if hasattr(writer, "add_figure"):
+        trainer.logger.log_hyperparams(hyperparameters, {"hp/best_val_loss": validation} | numbers)
+        rows = "".join(f"\n| {name} | {value} | {meaning} |" for name, value, meaning in table(metrics))
+        writer.add_text("results", "| figure | value | meaning |\n|---|---|---|" + rows)
+        for name, figure in pictures.items():
+            writer.add_figure(name, figure, global_step=trainer.global_step)
+        writer.flush()
+    else:
+        trainer.logger.log_metrics(numbers)
+
+
+def _new_folder(folder: str | Path | None) -> Path:
+    folder = Path(folder) if folder is not None else Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    if (folder / "config.yaml").exists():
+        raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
+    return folder
+
+
+def _settings(model: Formulation, **arguments: Any) -> dict[str, Any]:
+    described = describe(model)
+    return {"model": {"_target_": described["class"], **described["arguments"]}, **arguments}
+
+
+def _quiet() -> None:
+    """Silence, by message, what a user can't act on."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    for message in (
+        r".*isinstance\(treespec, LeafSpec\)",
+        r".*does not have many workers",
+        r".*smaller than the logging interval",
+        r".*Checkpoint directory .* exists and is not empty",
+        r".*ModelCheckpoint.* manual optimization",
+    ):
+        warnings.filterwarnings("ignore", message=message)

@@ -1,0 +1,103 @@
+"""The LightningModule: one formulation, its loss and its optimisers."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from lcplearn.formulations import Formulation, Windows, loss_terms
+from lcplearn.training.checkpoint import describe
+from lcplearn.training.optimizer import Optimizer
+
+
+class FormulationModule(pl.LightningModule):
+    """Train a formulation.
+
+    Optimisation is manual, in Lightning's words, because two optimisers take turns; both are in every checkpoint, so
+    that a training can be resumed on either side of the switch.
+
+    Args:
+        model: What to train.
+        loss: Weights of the loss terms.
+        horizon: Steps of a training window.
+        optimizer: Optimisers and their schedule.
+    """
+
+    def __init__(self, model: Formulation, *, loss: Mapping[str, float], horizon: int, optimizer: Optimizer) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.model, self.loss, self.optimizer, self.horizon = model, dict(loss), optimizer, horizon
+        self.seconds_before, self.started = 0.0, time.perf_counter()
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        return self.optimizer.build(self.model)
+
+    def on_fit_start(self) -> None:
+        self.started = time.perf_counter()
+
+    def on_train_epoch_start(self) -> None:
+        loader = self.trainer.train_dataloader
+        if hasattr(loader, "set_epoch"):
+            loader.set_epoch(self.current_epoch)
+        adam = self._optimizers()[0]
+        for group in adam.param_groups:
+            group["lr"] = self.optimizer.learning_rate(self.current_epoch, self.trainer.max_epochs or 1)
+
+    def training_step(self, windows: Windows, index: int) -> None:
+        finishes = self.optimizer.finishes(self.current_epoch)
+        active = self._optimizers()[-1 if finishes else 0]
+        report: dict[str, Tensor] = {}
+
+        def closure() -> Tensor:
+            active.zero_grad()
+            terms = self._terms(windows)
+            total = self._total(terms)
+            self.manual_backward(total)
+            report.update({name: term.detach() for name, term in terms.items()}, total=total.detach())
+            # All processes must see one loss, or their line searches part ways.
+            return self.trainer.strategy.reduce(total.detach(), reduce_op="mean") if finishes else total.detach()
+
+        active.step(closure=closure)
+        # A scalar costs 0.5 ms to log: only those that are shown are.
+        if self.logger and self.global_step % self.trainer.log_every_n_steps == 0:
+            scalars = {f"loss/{name}": float(value) for name, value in report.items()}
+            scalars["optimizer/lr"] = float(active.param_groups[0]["lr"])
+            self.logger.log_metrics(scalars, step=self.global_step)
+
+    def validation_step(self, windows: Windows, index: int) -> None:
+        total = self._total(loss_terms(self.model, windows, self.loss))
+        count = int(windows.valid.any(dim=1).sum())
+        self.log("val/loss", total, prog_bar=True, sync_dist=True, batch_size=max(count, 1))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["formulation"] = describe(self.model)
+        checkpoint["training"] = {"loss": self.loss, "horizon": self.horizon}
+        checkpoint["train_seconds"] = self.seconds
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.seconds_before = checkpoint["train_seconds"]
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in training so far [s], that before a resumption included."""
+        return self.seconds_before + time.perf_counter() - self.started
+
+    def _terms(self, windows: Windows) -> dict[str, Tensor]:
+        temperature = self.optimizer.temperature(self.current_epoch)
+        if not temperature or not hasattr(self.model, "temperature"):
+            return loss_terms(self.model, windows, self.loss)
+        self.model.temperature = temperature
+        try:
+            return loss_terms(self.model, windows, self.loss)
+        finally:
+            self.model.temperature = 0.0  # whoever predicts, validation included, sees the exact threshold
+
+    def _total(self, terms: Mapping[str, Tensor]) -> Tensor:
+        return torch.stack([self.loss[name] * term for name, term in terms.items()]).sum()
+
+    def _optimizers(self) -> list[Any]:
+        found = self.optimizers()
+        return found if isinstance(found, list) else [found]

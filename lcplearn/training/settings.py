@@ -1,0 +1,188 @@
+"""Check what a user wrote, in one sentence each and without importing torch.
+
+Settings are plain dictionaries here: only train.py knows Hydra. What a `_target_` accepts is read from its source.
+"""
+
+import ast
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+LOSS_TERMS = ("prediction", "rollout", "complementarity", "nonnegativity", "violation")  # a test compares with losses.py
+TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
+TYPES = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,), "None": (type(None),), "Path": (str,)}
+
+
+class SettingsError(ValueError):
+    """A mistake in the settings; the message is one sentence for the person who wrote them."""
+
+
+def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool = False) -> None:
+    """Refuse settings that can't be what was meant.
+
+    Args:
+        settings: The resolved settings of a run.
+        known: Names that may stand at the top level.
+        multirun: True in a sweep.
+
+    Raises:
+        SettingsError: the first mistake found.
+    """
+    for key in settings:
+        _known(key, known, "setting")
+    for group in ("data", "model", "optimizer", "logger"):
+        if settings.get(group) is not None:
+            _check_target(group, settings[group])
+    for key, kind in (("seed", "int"), ("threads", "int"), ("batch_size", "int | None"), ("patience", "int | None")):
+        _check_type(key, settings.get(key), kind)
+    if settings["threads"] < 1:
+        raise SettingsError(f"threads must be at least 1, got {settings['threads']}.")
+    _check_loss(settings["loss"])
+    _check_arguments("trainer", settings["trainer"], TRAINER)
+    strategy = str(settings["trainer"].get("strategy", "auto"))
+    if multirun and strategy.startswith("ddp") and not strategy.startswith(("ddp_fork", "ddp_spawn")):
+        raise SettingsError(f"A sweep (-m) can't run with trainer.strategy={strategy}: use trainer.strategy=ddp_fork.")
+    _check_checkpoint(settings.get("ckpt_path"))
+
+
+def _check_loss(loss: Mapping[str, Any]) -> None:
+    for key, value in loss.items():
+        _known(key, (*LOSS_TERMS, "horizon"), "setting", prefix="loss.")
+        _check_type(f"loss.{key}", value, "int" if key == "horizon" else "float")
+        if not 0 <= value < float("inf"):
+            raise SettingsError(f"loss.{key} must be finite and at least 0, got {value}.")
+    if not any(loss.get(term) for term in LOSS_TERMS):
+        raise SettingsError("All loss weights are zero: set one, for instance loss.prediction=1.0.")
+    if loss.get("horizon", 1) < 1:
+        raise SettingsError(f"loss.horizon must be at least 1, got {loss['horizon']}.")
+
+
+def _check_checkpoint(path: Any) -> None:
+    _check_type("ckpt_path", path, "str | None")
+    if path is None or Path(path).is_file():
+        return
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    there = sorted(str(file) for file in folder.glob("**/*.ckpt"))[:3] if folder != Path(".") else []
+    hint = f"did you mean {' or '.join(there)}?" if there else "checkpoints are named runs/DATE_TIME/last.ckpt."
+    raise SettingsError(f"ckpt_path={path} is not a file; {hint}")
+
+
+def _check_target(group: str, values: Any) -> None:
+    if not isinstance(values, Mapping) or not isinstance(values.get("_target_"), str):
+        raise SettingsError(f"{group} must be the name of a file in conf/{group}/, got {values!r}.")
+    arguments = {key: value for key, value in values.items() if not key.startswith("_")}
+    _check_arguments(group, arguments, values["_target_"])
+
+
+def _check_arguments(group: str, arguments: Mapping[str, Any], target: str) -> None:
+    accepted = signature(target)
+    if accepted is None:  # not written in Python, or re-exported: the call itself will tell
+        return
+    for key, value in arguments.items():
+        if "**" not in accepted:
+            _known(key, accepted, "setting", prefix=f"{group}.")
+        _check_type(f"{group}.{key}", value, accepted.get(key, ""))
+
+
+def _known(key: str, known: Iterable[str], what: str, prefix: str = "") -> None:
+    if key not in known:
+        raise SettingsError(f"Unknown {what} '{prefix}{key}'; {_suggestion(key, known, prefix)}")
+
+
+def _suggestion(key: str, known: Iterable[str], prefix: str = "") -> str:
+    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    if close:
+        return f"did you mean '{prefix}{close[0]}'?"
+    return f"known are {', '.join(sorted(prefix + name for name in known))}."
+
+
+def _check_type(name: str, value: Any, annotation: str) -> None:
+    """Compare with an annotation made of int, float, str, bool, Path and None; others are the target's own business."""
+    text = re.sub(r"Optional\[(\w+)\]", r"\1 | None", annotation.replace("typing.", ""))
+    text = re.sub(r"Union\[([\w, ]+)\]", lambda match: match[1].replace(",", " |"), text)
+    kinds = [kind.strip() for kind in text.split("|")]
+    if not all(kind in TYPES for kind in kinds):
+        return
+    allowed = tuple(cls for kind in kinds for cls in TYPES[kind])
+    wrong_bool = isinstance(value, bool) and bool not in allowed  # bool is an int to isinstance
+    if wrong_bool or not isinstance(value, allowed):
+        raise SettingsError(f"{name} must be {' or '.join(kinds)}, got {value!r}.")
+
+
+def signature(target: str) -> dict[str, str] | None:
+    """Argument names and annotations of a class or function, from its source; None if it can't be found there.
+
+    `**` is among the names where any keyword is accepted.
+    """
+    package, *modules, name = target.split(".")
+    spec = find_spec(package) if modules else None
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    path = Path(spec.submodule_search_locations[0]).joinpath(*modules)
+    file = next((f for f in (path.with_suffix(".py"), path / "__init__.py") if f.is_file()), None)
+    if file is None:
+        return None
+    definitions = {
+        node.name: node
+        for node in ast.parse(file.read_text()).body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef)
+    }
+    return _arguments(definitions, name)
+
+
+def _arguments(definitions: Mapping[str, ast.ClassDef | ast.FunctionDef], name: str) -> dict[str, str] | None:
+    node = definitions.get(name)
+    if isinstance(node, ast.ClassDef):
+        init = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+        if init is None and any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
+            fields = [n for n in node.body if isinstance(n, ast.AnnAssign)]
+            return {ast.unparse(field.target): ast.unparse(field.annotation) for field in fields}
+        if init is None:
+            base = next((b.id for b in node.bases if isinstance(b, ast.Name)), "")
+            return _arguments(definitions, base)
+        node = init
+    if node is None:
+        return None
+    found = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+    names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in found if a.arg != "self"}
+    return names | ({"**": ""} if node.args.kwarg else {})
+
+
+def explain(message: str, conf: Path) -> str:
+    """Turn Hydra's message about a mistyped override into one sentence with a suggestion.
+
+    Args:
+        message: Text of Hydra's error.
+        conf: Folder of the configuration.
+    """
+    unknown = re.search(r"Could not override '([\w.@/]+)'", message)
+    missing = re.search(r"Could not find '([\w./]+)/([\w.-]+)'", message)
+    if missing:
+        group, choice = missing[1], missing[2]
+        options = [file.stem for file in (conf / group).glob("*.yaml")]
+        return f"There is no {group}={choice}; {_suggestion(choice, options)}"
+    if unknown:
+        group, _, key = unknown[1].rpartition(".")
+        in_files, in_code = _vocabulary(conf, group)
+        if key in in_code and key not in in_files:
+            return f"'{unknown[1]}' is not set in conf/{group}; to add it, write +{unknown[1]}=..."
+        prefix = f"{group}." if group else ""
+        return f"Unknown setting '{unknown[1]}'; {_suggestion(key, in_files | in_code, prefix)}"
+    return " ".join(message.split())
+
+
+def _vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:
+    """Keys of a group's files, and those that its targets accept besides."""
+    files = list((conf / group).glob("*.yaml")) if group else [conf / "train.yaml"]
+    contents = [yaml.safe_load(file.read_text()) or {} for file in files]
+    in_files = {key for content in contents for key in content if not key.startswith("_")} - {"defaults"}
+    if not group:
+        return in_files | {folder.name for folder in conf.iterdir() if folder.is_dir()}, set()
+    targets = {content["_target_"] for content in contents if "_target_" in content}
+    targets |= {TRAINER} if group == "trainer" else set()
+    return in_files, {name for target in targets for name in signature(target) or {}} - {"**", "dt", "gravity"}
