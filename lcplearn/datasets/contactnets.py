@@ -1,4 +1,6 @@
-"""Turn the published ContactNets cube tosses into data files: python -m lcplearn.datasets.contactnets FOLDER --out data/
+"""Turn the published ContactNets cube tosses into data files.
+
+Usage: python -m lcplearn.datasets.contactnets FOLDER --out data/
 
 FOLDER is `data/tosses_processed` in a clone of github.com/DAIRLab/contact-nets (BSD-3-Clause). Each toss is a file
 NUMBER.pt with a tensor [1, T, 19]: position (x, y, z), quaternion of the body in the world (w, x, y, z), velocity,
@@ -8,6 +10,7 @@ angular velocity in the body frame, six unused controls; lengths in half widths 
 import argparse
 import pickle
 import sys
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,7 +57,8 @@ def read_toss(path: Path | str) -> NDArray:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        toss = torch.load(path, weights_only=True, map_location="cpu")
+        with warnings.catch_warnings(action="ignore"):  # about odd pickles: the ValueError below says it
+            toss = torch.load(path, weights_only=True, map_location="cpu")
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError):
         raise ValueError(f"{path}: expected one saved tensor, got something that can't be read without risk") from None
     columns = len(TOSS_COLUMNS) + _CONTROLS
@@ -131,7 +135,7 @@ def convert(folder: Path | str) -> tuple[dict[str, NDArray], dict[str, NDArray]]
     paths = sorted((path for path in folder.glob("*.pt") if path.stem.isdecimal()), key=lambda path: int(path.stem))
     if not paths:
         raise FileNotFoundError(
-            f"{folder}: expected toss files 0.pt, 1.pt, ... (data/tosses_processed in a clone of contact-nets), got none"
+            f"{folder}: expected toss files 0.pt, 1.pt, ... (data/tosses_processed of contact-nets), got none"
         )
     numbers = np.array([int(path.stem) for path in paths], dtype=np.int32)
     tosses = [read_toss(path) for path in paths]

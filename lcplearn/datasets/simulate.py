@@ -112,8 +112,8 @@ def simulate_sliding_block(
 
 
 def friction_labels(
-    block: SlidingBlock, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"], kind: FrictionLabels
-) -> Float[Tensor, "*batch 2"]:
+    block: SlidingBlock, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"], kind: FrictionLabels
+) -> Float[Tensor, "... 2"]:
     """Friction of a step in the pairs that the notes' learning problems take as known.
 
     With F the physical friction force on the block and lambda-', lambda+' the slacks of the direct LCP:

@@ -32,7 +32,7 @@ class FallingBlock:
     gravity: float | Tensor = 9.81
 
     def lcp(
-        self, gap: Float[Tensor, "*batch"], velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
+        self, gap: Float[Tensor, "*#batch"], velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
     ) -> tuple[Tensor, Tensor]:
         """The LCP of one step.
 
@@ -49,12 +49,12 @@ class FallingBlock:
         return _one_row(stiffness, free_gap), -(stiffness * free_gap).unsqueeze(-1)
 
     def closed_form(
-        self, gap: Float[Tensor, "*batch"], velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
+        self, gap: Float[Tensor, "*#batch"], velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "..."]:
         """Next gap max(x_k + dt v_k + dt^2 (u/m - g), 0) [m]."""
         return torch.relu(gap + self.dt * self._free_velocity(velocity, force))
 
-    def advance(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> tuple[Tensor, Tensor]:
+    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
         """Next state [*batch, 2] and contact mode [*batch, 1]: SEPARATION, or STICK while the gap is 0."""
         gap, velocity = state.unbind(-1)
         next_gap = solve_lcp(*self.lcp(gap, velocity, force[..., 0]), method="diagonal").z[..., 0]
@@ -65,11 +65,11 @@ class FallingBlock:
         mode = torch.where(next_gap > 0, int(Mode.SEPARATION), int(Mode.STICK))
         return torch.stack((next_gap, next_velocity), dim=-1), mode.unsqueeze(-1)
 
-    def step(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 2"]:
+    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
         """Next state: gap [m] and upward velocity [m/s]."""
         return self.advance(state, force)[0]
 
-    def rollout(self, state: Float[Tensor, "*batch 2"], forces: Float[Tensor, "*batch T 1"]) -> Trajectory:
+    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
         """Trajectory over T forces [N] from a state."""
         return rollout(self.advance, state, forces)
 
@@ -100,13 +100,13 @@ class BouncingBlock:
     dt: float
     gravity: float | Tensor = 9.81
 
-    def lcp(self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
+    def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step in contact: M [*#batch, 1, 1], q [*batch, 1], from velocity [m/s] and force [N]."""
         inertia = self.mass / self.dt
         excess = self._free_velocity(velocity, force) + self.restitution * velocity
         return _one_row(inertia, excess), -(inertia * excess).unsqueeze(-1)
 
-    def advance(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> tuple[Tensor, Tensor]:
+    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
         """Next state [*batch, 2] and contact mode [*batch, 1]: SEPARATION, or STICK while the ground pushes."""
         gap, velocity = state.unbind(-1)
         solution = solve_lcp(*self.lcp(velocity, force[..., 0]), method="diagonal")
@@ -117,11 +117,11 @@ class BouncingBlock:
         mode = torch.where(in_contact, int(Mode.STICK), int(Mode.SEPARATION))
         return torch.stack((gap + self.dt * next_velocity, next_velocity), dim=-1), mode.unsqueeze(-1)
 
-    def step(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 2"]:
+    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
         """Next state: gap [m] and upward velocity [m/s]."""
         return self.advance(state, force)[0]
 
-    def rollout(self, state: Float[Tensor, "*batch 2"], forces: Float[Tensor, "*batch T 1"]) -> Trajectory:
+    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
         """Trajectory over T forces [N] from a state."""
         return rollout(self.advance, state, forces)
 

@@ -35,7 +35,7 @@ Step = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def rollout(
-    step: Step, state: Float[Tensor, "*batch nq+nv"], forces: Float[Tensor, "*batch T nv"]
+    step: Step, state: Float[Tensor, "*#batch nq_plus_nv"], forces: Float[Tensor, "*#batch T nv"]
 ) -> Trajectory:
     """Apply a step T times.
 

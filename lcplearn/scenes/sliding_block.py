@@ -13,7 +13,7 @@ from lcplearn.scenes.rollout import Mode, Trajectory, rollout
 Form = Literal["direct", "physical", "traditional"]
 
 
-def slide(p: Float[Tensor, "*batch"], c: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*batch"]:
+def slide(p: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "..."]:
     """Velocity of a block after friction has taken what it can.
 
     S(p, c) = sign(p) max(|p| - c, 0), the closed form of every friction LCP in this file.
@@ -59,7 +59,7 @@ class OneWayBlock:
         _require_positive("dt", self.dt)
         _require_positive("mass", self.mass)
 
-    def lcp(self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
+    def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step.
 
         Args:
@@ -73,25 +73,25 @@ class OneWayBlock:
         q = self.mu * self.mass * self.gravity - inertia * velocity - force
         return _matrix(inertia, [[1.0]], q), q.unsqueeze(-1)
 
-    def closed_form(self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def closed_form(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> Float[Tensor, "..."]:
         """Next velocity max(p - c, 0) [m/s], p = v_k + u dt/m, c = mu g dt."""
         return torch.relu(velocity + force * self.dt / self.mass - self.mu * self.gravity * self.dt)
 
     def next_velocity(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
+        self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "..."]:
         """Next velocity [m/s], from the LCP."""
         return solve_lcp(*self.lcp(velocity, force), method="diagonal").z[..., 0]
 
-    def advance(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> tuple[Tensor, Tensor]:
+    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
         """Next state [*batch, 2] and contact mode [*batch, 1]."""
         return _advance(state, self.next_velocity(state[..., 1], force[..., 0]), self.dt)
 
-    def step(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 2"]:
+    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
         """Next state: position [m] and velocity [m/s]."""
         return self.advance(state, force)[0]
 
-    def rollout(self, state: Float[Tensor, "*batch 2"], forces: Float[Tensor, "*batch T 1"]) -> Trajectory:
+    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
         """Trajectory over T forces [N] from a state."""
         return rollout(self.advance, state, forces)
 
@@ -137,7 +137,7 @@ class SlidingBlock:
         if self.form not in ("direct", "physical", "traditional"):
             raise ValueError(f"form: expected 'direct', 'physical' or 'traditional', got {self.form!r}")
 
-    def lcp(self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
+    def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step in this block's form.
 
         Args:
@@ -159,13 +159,13 @@ class SlidingBlock:
         pattern = [[1.0, 0.0], [0.0, 1.0]] if self.form == "direct" else [[1.0, -1.0], [-1.0, 1.0]]
         return _matrix(inertia, pattern, push), torch.stack((limit - push, limit + push), dim=-1)
 
-    def closed_form(self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def closed_form(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> Float[Tensor, "..."]:
         """Next velocity S(p, c) [m/s]."""
         return slide(self._free_velocity(velocity, force), self.mu * self.gravity * self.dt)
 
     def next_velocity(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
+        self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "..."]:
         """Next velocity [m/s], from the LCP of this block's form."""
         M, q = self.lcp(velocity, force)
         z = solve_lcp(M, q, method="diagonal" if self.form == "direct" else "auto").z
@@ -175,15 +175,15 @@ class SlidingBlock:
         gamma = z[..., 2]
         return torch.minimum(torch.maximum(v, -gamma), gamma)
 
-    def advance(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> tuple[Tensor, Tensor]:
+    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
         """Next state [*batch, 2] and contact mode [*batch, 1]."""
         return _advance(state, self.next_velocity(state[..., 1], force[..., 0]), self.dt)
 
-    def step(self, state: Float[Tensor, "*batch 2"], force: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 2"]:
+    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
         """Next state: position [m] and velocity [m/s]."""
         return self.advance(state, force)[0]
 
-    def rollout(self, state: Float[Tensor, "*batch 2"], forces: Float[Tensor, "*batch T 1"]) -> Trajectory:
+    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
         """Trajectory over T forces [N] from a state."""
         return rollout(self.advance, state, forces)
 
@@ -191,7 +191,7 @@ class SlidingBlock:
         return velocity + force * self.dt / self.mass
 
 
-def _advance(state: Tensor, next_velocity: Tensor, dt: float) -> tuple[Tensor, Int[Tensor, "*batch 1"]]:
+def _advance(state: Tensor, next_velocity: Tensor, dt: float) -> tuple[Tensor, Int[Tensor, "... 1"]]:
     """Implicit Euler for the position; the mode is SLIP where the block moves after the step."""
     position = state[..., 0] + dt * next_velocity
     mode = torch.where(next_velocity == 0, int(Mode.STICK), int(Mode.SLIP))

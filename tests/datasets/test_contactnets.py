@@ -1,0 +1,160 @@
+"""The converter of the published tosses, against the shared files made from the same tosses."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lcplearn.datasets import read_cube_slides
+from lcplearn.datasets.contactnets import convert, final_slide, main, read_toss
+
+
+def shared(name: str) -> Path:
+    path = Path(os.environ.get("LCPLEARN_DATA") or "data") / name
+    if not path.exists():
+        pytest.skip(f"needs real data: {path} is missing (set LCPLEARN_DATA to its folder)")
+    return path
+
+
+def record(file: dict[str, np.ndarray], rows: str, number: int) -> np.ndarray:
+    k = int(np.flatnonzero(file["source_id"] == number)[0])
+    return file[rows][file["offsets"][k] : file["offsets"][k + 1]]
+
+
+def test_the_five_raw_files_give_the_shared_rows():
+    """Issue, section 3: to 1e-12."""
+    tosses, slides = convert(shared("contactnets_raw"))
+    with np.load(shared("cube_tosses.npz")) as file:
+        expected_tosses = dict(file)
+    with np.load(shared("cube_slides.npz")) as file:
+        expected_slides = dict(file)
+    assert tosses["source_id"].tolist() == slides["source_id"].tolist() == [0, 1, 10, 100, 101]
+    for number in tosses["source_id"]:
+        np.testing.assert_array_equal(record(tosses, "state", number), record(expected_tosses, "state", number))
+        ours, theirs = record(slides, "data", number), record(expected_slides, "data", number)
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+        k, j = (int(np.flatnonzero(file["source_id"] == number)[0]) for file in (slides, expected_slides))
+        assert slides["source_start_row"][k] == expected_slides["source_start_row"][j]
+    for made, expected in ((tosses, expected_tosses), (slides, expected_slides)):
+        assert set(expected) - set(made) <= {"source_commit"}
+        for name in ("columns", "dt", "g", "g_scaled", "mass_kg", "half_width_m", "corners_scaled", "inertia_kg_m2"):
+            if name in expected:
+                np.testing.assert_array_equal(made[name], expected[name])
+
+
+def test_all_456_shared_tosses_give_the_443_shared_slides():
+    with np.load(shared("cube_tosses.npz")) as file:
+        tosses = dict(file)
+    with np.load(shared("cube_slides.npz")) as file:
+        slides = dict(file)
+    found = {}
+    for number in tosses["source_id"].tolist():
+        slide = final_slide(record(tosses, "state", number))
+        if slide is not None:
+            found[number] = slide
+    assert sorted(found) == sorted(slides["source_id"].tolist())
+    for k, number in enumerate(slides["source_id"].tolist()):
+        assert found[number].start_row == slides["source_start_row"][k]
+        np.testing.assert_allclose(found[number].rows, record(slides, "data", number), rtol=0, atol=1e-12)
+
+
+def toss(rows: int = 30, speed: float = 0.5, height: float = 1.0) -> torch.Tensor:
+    """A cube that slides flat along (3, 4)/5, lengths in half widths of 0.0524 m."""
+    state = torch.zeros(1, rows, 19, dtype=torch.float64)
+    state[..., 3] = 1.0
+    state[..., 2] = height
+    state[..., 7:9] = torch.tensor([0.6, 0.8]) * speed / 0.0524
+    state[..., :2] = state[..., 7:9] * torch.arange(rows)[:, None] / 148
+    return state
+
+
+def test_a_slide_is_measured_along_and_across_the_line_from_start_to_stop():
+    """lateral = d_x y - d_y x."""
+    state = toss()
+    state[0, 10, :2] += torch.tensor([-0.8, 0.6])  # one half width to the left of the direction of motion
+    rows = final_slide(state[0, :, :13].numpy()).rows
+    np.testing.assert_allclose(rows[:, 1], 0.5 * np.arange(30) / 148, atol=1e-12)
+    np.testing.assert_allclose(rows[:, 2], 0.5, atol=1e-12)
+    np.testing.assert_allclose(rows[:, 3], np.where(np.arange(30) == 10, 0.0524, 0.0), atol=1e-12)
+    np.testing.assert_allclose(rows[:, 4], 0.0524, atol=1e-12)
+
+
+def test_a_toss_without_a_flat_fast_long_end_has_no_slide():
+    assert final_slide(toss(rows=15)[0, :, :13].numpy()) is None
+    assert final_slide(toss(speed=0.09)[0, :, :13].numpy()) is None
+    assert final_slide(toss(height=1.2)[0, :, :13].numpy()) is None
+    spinning = toss()[0, :, :13].numpy()
+    spinning[:, 12] = 1.5
+    assert final_slide(spinning) is None
+    bump = toss()[0, :, :13].numpy()
+    bump[12, 9] = 2.0
+    assert final_slide(bump).start_row == 13
+
+
+def test_one_command_makes_files_that_the_reader_takes(tmp_path):
+    (tmp_path / "raw").mkdir()
+    for number in (0, 2, 10, 11):
+        torch.save(toss(rows=20 + number), tmp_path / "raw" / f"{number}.pt")
+    command = [sys.executable, "-m", "lcplearn.datasets.contactnets", str(tmp_path / "raw"), "--out"]
+    done = subprocess.run([*command, str(tmp_path / "data")], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert "4 tosses" in done.stdout
+    data = read_cube_slides(tmp_path / "data" / "cube_slides.npz", training_slides=3, validation_slides=1)
+    assert sorted([*data.train.steps.tolist(), *data.validation.steps.tolist(), *data.test.steps.tolist()]) == [
+        19,
+        21,
+        29,
+        30,
+    ]
+    with np.load(tmp_path / "data" / "cube_tosses.npz", allow_pickle=False) as file:
+        assert file["source_id"].tolist() == [0, 2, 10, 11]
+        assert file["state"].shape == (20 + 22 + 30 + 31, 13)
+
+
+class Payload:
+    """Runs code when unpickled without care."""
+
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('a pickle ran')",))
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (torch.zeros(1, 5, 13), r"expected a tensor of shape \[1, T, 19\], got \[1, 5, 13\]"),
+        ({"state": torch.zeros(1, 5, 19)}, r"expected a tensor of shape \[1, T, 19\], got dict"),
+        (torch.zeros(1, 0, 19), "expected at least one row, got none"),
+        (torch.full((1, 5, 19), torch.nan), "95 values are NaN or infinite"),
+        (torch.ones(1, 5, 19), r"expected the last 6 columns \(controls\) to be zero"),
+        (Payload(), "can't be read without risk"),
+    ],
+)
+def test_a_bad_toss_is_explained_in_one_sentence(tmp_path, content, sentence):
+    torch.save(content, tmp_path / "0.pt")
+    with pytest.raises(ValueError, match=sentence) as caught:
+        convert(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no tensor", pickle.dumps(Payload())])
+def test_a_file_that_is_no_tensor_is_explained_and_not_run(tmp_path, content):
+    (tmp_path / "0.pt").write_bytes(content)
+    with pytest.raises(ValueError, match=r"0\.pt: expected one saved tensor"):
+        read_toss(tmp_path / "0.pt")
+
+
+def test_the_command_ends_with_one_sentence_and_no_traceback(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="1"):
+        main([str(tmp_path), "--out", str(tmp_path / "out")])
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(FileNotFoundError, match=r"7\.pt: no such file"):
+        read_toss(tmp_path / "7.pt")
+    torch.save(toss(height=2.0), tmp_path / "0.pt")
+    with pytest.raises(ValueError, match="none of the 1 tosses ends in a flat slide"):
+        convert(tmp_path)

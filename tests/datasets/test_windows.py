@@ -1,0 +1,123 @@
+"""Windows cut from recordings, and their batches over epochs and processes."""
+
+import collections
+
+import pytest
+import torch
+
+from lcplearn.datasets import Recordings, WindowLoader, windows
+from lcplearn.formulations.losses import Windows
+
+
+def ragged(steps: list[int]) -> Recordings:
+    """Recording n has velocity 100 n + k at instant k and force 100 n + k in step k; padding is -1."""
+    horizon = max(steps)
+    lengths = torch.tensor(steps)[:, None]
+    instants = torch.arange(horizon + 1)
+    value = 100.0 * torch.arange(len(steps))[:, None] + instants
+    velocities = torch.where(instants <= lengths, value, -1.0)
+    forces = torch.where(instants[:-1] < lengths, value[:, :-1], -1.0)
+    friction = torch.stack((forces, -forces), dim=-1)
+    return Recordings(velocities, velocities, forces, friction, lengths[:, 0], None)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_windows_are_all_stretches_of_k_steps_and_no_padding(k):
+    steps = [4, 6, 5]
+    cut = windows(ragged(steps), k)
+    starts = [100.0 * n + s for n, length in enumerate(steps) for s in range(length - k + 1)]
+    assert cut.velocity[:, 0].tolist() == starts
+    assert cut.valid.all()
+    assert torch.equal(cut.velocity, torch.tensor(starts)[:, None] + torch.arange(k + 1))
+    assert torch.equal(cut.force, cut.velocity[:, :-1])
+    assert torch.equal(cut.friction, torch.stack((cut.force, -cut.force), dim=-1))
+
+
+def test_a_recording_shorter_than_a_window_is_masked_after_its_end():
+    cut = windows(ragged([2, 5]), 4)
+    assert cut.valid.tolist() == [[True, True, False, False], [True] * 4, [True] * 4]
+    assert cut.velocity[0, :3].tolist() == [0, 1, 2]
+    assert windows(ragged([2, 3]), 7).valid.sum(dim=1).tolist() == [2, 3]
+
+
+def test_whole_recordings_are_the_longest_windows():
+    data = ragged([2, 5, 3])
+    cut = windows(data)
+    assert torch.equal(cut.velocity, data.velocities)
+    assert cut.valid.sum(dim=1).tolist() == [2, 5, 3]
+    assert windows(data._replace(friction=None)).friction is None
+
+
+def test_a_window_needs_a_step():
+    with pytest.raises(ValueError, match=r"^k: expected at least 1 step, got 0"):
+        windows(ragged([3]), 0)
+
+
+def numbered(count: int) -> Windows:
+    number = torch.arange(float(count))[:, None]
+    return Windows(number.expand(-1, 2), number, None, torch.ones(count, 1, dtype=torch.bool))
+
+
+def drawn(loader: WindowLoader) -> list[list[int]]:
+    return [batch.velocity[:, 0].int().tolist() for batch in loader]
+
+
+@pytest.mark.parametrize("world_size", [1, 2, 3, 5])
+@pytest.mark.parametrize("batch_size", [None, 1, 4, 100])
+@pytest.mark.parametrize("shuffle", [True, False])
+def test_ranks_get_equal_batches_that_together_cover_everything(world_size, batch_size, shuffle):
+    """Two-process DDP deadlocks or forgets data otherwise. Nothing comes more than once beyond the padding."""
+    for count in (1, 3, 10, 23):
+        loaders = [
+            WindowLoader(numbered(count), batch_size=batch_size, shuffle=shuffle, rank=rank, world_size=world_size)
+            for rank in range(world_size)
+        ]
+        batches = [drawn(loader) for loader in loaders]
+        sizes = [[len(batch) for batch in of_rank] for of_rank in batches]
+        assert all(size == sizes[0] for size in sizes)
+        assert all(len(loader) == len(sizes[0]) for loader in loaders)
+        seen = collections.Counter(number for of_rank in batches for batch in of_rank for number in batch)
+        assert set(seen) == set(range(count))
+        assert sum(seen.values()) - count < world_size
+
+
+def test_fields_of_a_batch_belong_together():
+    data = windows(ragged([4, 6, 5]), 2)
+    for batch in WindowLoader(data, batch_size=4):
+        assert torch.equal(batch.velocity[:, :-1], batch.force)
+        assert torch.equal(batch.friction[..., 0], batch.force)
+        assert batch.valid.shape == batch.force.shape
+
+
+def test_the_order_depends_on_seed_and_epoch_and_nothing_else():
+    """A resumed run sees the batches that the unbroken one would have seen."""
+    loader = WindowLoader(numbered(50), batch_size=7, seed=1)
+    first = drawn(loader)
+    assert drawn(loader) == first
+    loader.set_epoch(1)
+    second = drawn(loader)
+    assert second != first
+    other = WindowLoader(numbered(50), batch_size=7, seed=1)
+    other.sampler.set_epoch(1)  # as Lightning does before each epoch
+    assert drawn(other) == second
+    assert drawn(WindowLoader(numbered(50), batch_size=7, seed=2)) != first
+    assert drawn(WindowLoader(numbered(5), shuffle=False)) == [[0, 1, 2, 3, 4]]
+
+
+def test_the_full_batch_is_the_default():
+    assert len(WindowLoader(numbered(50))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("batch_size", {"batch_size": 0}),
+        ("rank", {"rank": 2, "world_size": 2}),
+        ("rank, world_size", {"rank": 0}),
+    ],
+)
+def test_a_wrong_argument_is_named(name, arguments):
+    with pytest.raises(ValueError, match=f"^{name}: expected .* got"):
+        WindowLoader(numbered(3), **arguments)
+    with pytest.raises(ValueError, match=r"^windows: expected at least one window, got none"):
+        WindowLoader(numbered(0))
