@@ -26,6 +26,8 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba.core import types
+from numba.extending import intrinsic
 
 RUIZ_SWEEPS = 4  # as in residuals.py
 EPS = 2.220446049250313e-16
@@ -104,7 +106,8 @@ def solve_batch(
     M = M if M.flags.writeable else M.copy()
     q = q if q.flags.writeable else q.copy()
     budget = -1 if max_iter is None else max_iter
-    _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, *result)
+    floats, integers = np.empty(3 * n * n + 16 * n), np.empty(9 * n, dtype=np.int64)  # scratch
+    _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, floats, integers, *result)
     return result
 
 
@@ -137,7 +140,9 @@ def solve_adjoint(
     grad_M = np.zeros(M.shape if need_M else (0, 0, 0))
     if grad_q.size:
         M = M if M.flags.writeable else M.copy()
-        _adjoint_range(M, z, basis, grad_z, grad_w, solved, grad_M, grad_q)
+        n = z.shape[-1]
+        floats, integers = np.empty(n * n + 2 * n), np.empty(3 * n, dtype=np.int64)  # scratch
+        _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M, grad_q)
     return (grad_M if need_M else None), grad_q
 
 
@@ -152,7 +157,38 @@ def _announce_compilation() -> None:
         sys.stderr.write("lcplearn: compiling the LCP kernel, once per machine (10-20 s)\n")
 
 
+# --- memory ---------------------------------------------------------------------------------------------------------
+#
+# numba counts references, atomically, for every array passed from function to function, and that takes longer than
+# solving a small problem. So the kernels see bare views of arrays that `solve_batch` keeps alive.
+
+
+@intrinsic
+def _pointer(_, address, example):
+    """The address as a pointer to numbers of the example's type."""
+
+    def codegen(context, builder, signature, args):
+        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(example)(types.uintp, example), codegen
+
+
+@_jit
+def _matrix(memory, start, rows, columns):
+    """View of part of a vector of doubles."""
+    return numba.carray(_pointer(memory.ctypes.data + 8 * start, memory[0]), (rows, columns))
+
+
+@_jit
+def _vector(memory, start, size):
+    """View of part of a vector of 8-byte numbers."""
+    return numba.carray(_pointer(memory.ctypes.data + 8 * start, memory[0]), (size,))
+
+
 # --- linear algebra -------------------------------------------------------------------------------------------------
+#
+# An inner loop that does not start at zero counts in unsigned integers: numba lets a signed index count from the end,
+# and the test for that keeps LLVM from vectorising.
 
 
 @_jit
@@ -182,7 +218,7 @@ def _factor(A, k, rows, cols, threshold, complete):
             factor = A[i, c] * inverse
             A[i, c] = factor
             if factor != 0.0:
-                for j in range(c + 1, k):
+                for j in range(np.uint64(c + 1), np.uint64(k)):
                     A[i, j] -= factor * A[c, j]
     return k
 
@@ -199,12 +235,13 @@ def _solve(A, k, rank, rows, cols, x, scratch):
         x[i] -= total
     for i in range(rank - 1, -1, -1):
         total = 0.0
-        for j in range(i + 1, rank):
+        for j in range(np.uint64(i + 1), np.uint64(rank)):
             total += A[i, j] * x[j]
         x[i] = (x[i] - total) / A[i, i]
     for c in range(k):
-        scratch[cols[c]] = x[c] if c < rank else 0.0
-    x[:k] = scratch[:k]
+        scratch[c] = x[c] if c < rank else 0.0
+    for c in range(k):
+        x[cols[c]] = scratch[c]
 
 
 @_jit
@@ -226,28 +263,41 @@ def _gather(S, basis, A, index):
 
 
 @_jit
+def _nonnegative(x):
+    for i in range(x.size):
+        if x[i] < 0.0:
+            return False
+    return True
+
+
+@_jit
 def _all_finite(x):
     """Whether no entry is NaN or infinite."""
     bad = 0
-    for i in range(x.size):
-        bad += not abs(x[i]) <= 1.7976931348623157e308
+    for value in x.flat:
+        bad += not abs(value) <= 1.7976931348623157e308
     return bad == 0
 
 
 @_jit
 def _equilibrate(M, size, largest, d):
     """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; size and largest are scratch."""
-    n = M.shape[0]
+    n = d.size
     for i in range(n):
         d[i] = 1.0
         for j in range(i + 1):
             a, b = abs(M[i, j]), abs(M[j, i])
-            size[i, j] = size[j, i] = a if a > b else b
+            if b > a:
+                a = b
+            size[i, j] = a
+            size[j, i] = a
     for _ in range(RUIZ_SWEEPS):
-        largest[:n] = 0.0
+        for j in range(n):
+            largest[j] = 0.0
         for i in range(n):
+            di = d[i]
             for j in range(n):
-                scaled = size[i, j] * d[i]
+                scaled = size[i, j] * di
                 largest[j] = scaled if scaled > largest[j] else largest[j]
         change = 0.0
         for j in range(n):
@@ -329,7 +379,7 @@ def _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch):
             i = index[a]
             x[a] = w[i]
             worst = max(worst, abs(w[i]) / omega[i] if w[i] != 0.0 else 0.0)
-        if not worst > 2.0 * EPS:
+        if not worst > 8.0 * EPS:  # rounding of the residual itself
             break
         _solve(A, k, rank, rows, cols, x, scratch)
         for a in range(k):
@@ -408,39 +458,44 @@ def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, 
 
 
 @_jit
-def _start_tableau(S, p, cover, T, basic, column, place, buffer):
+def _start_tableau(S, p, cover, T, basic, column, place):
     """Dictionary at w = p + S z + cover z_0, with z_0 already exchanged for the lexicographically smallest row."""
     n = p.size
     row, smallest = 0, np.inf
     for i in range(n):
-        for j in range(n):
-            T[i, j] = S[i, j]
-        T[i, n] = cover[i]
-        T[i, n + 1] = p[i]
         basic[i], column[i] = i, n + i
         place[i], place[n + i] = i, -1 - i
         if p[i] / cover[i] <= smallest:  # ties: the last has the smallest row of the identity
             row, smallest = i, p[i] / cover[i]
-    column[n], place[2 * n] = 2 * n, -1 - n
-    _exchange(T, basic, column, place, row, n, buffer)
+    for i in range(n):
+        ratio = cover[i] / cover[row]
+        for j in range(n):
+            T[i, j] = S[i, j] - ratio * S[row, j]
+        T[i, n], T[i, n + 1] = ratio, p[i] - ratio * p[row]
+    for j in range(n):
+        T[row, j] = -S[row, j] / cover[row]
+    T[row, n], T[row, n + 1] = 1.0 / cover[row], -p[row] / cover[row]
+    basic[row], column[n] = 2 * n, row
+    place[2 * n], place[row] = row, -1 - n
     return row
 
 
 @_jit
 def _exchange(T, basic, column, place, row, c, buffer):
     """Pivot: the nonbasic variable of column c becomes basic in this row."""
-    n = basic.size
+    n, width = T.shape
     inverse = 1.0 / T[row, c]
     T[row, c] = -1.0
-    for j in range(n + 2):
+    for j in range(width):
         buffer[j] = -inverse * T[row, j]
-        T[row, j] = buffer[j]
     for i in range(n):
         factor = T[i, c]
-        if i != row and factor != 0.0:
+        if factor != 0.0 and i != row:
             T[i, c] = 0.0
-            for j in range(n + 2):
+            for j in range(width):
                 T[i, j] += factor * buffer[j]
+    for j in range(width):
+        T[row, j] = buffer[j]
     basic[row], column[c] = column[c], basic[row]
     place[basic[row]], place[column[c]] = row, -1 - c
 
@@ -485,7 +540,7 @@ def _leaving_row(T, basic, place, c, tolerance, ratio, tied):
 def _lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, basis, z, cap):
     """Follow Lemke's path until z_0 leaves; z and basis of the last dictionary, how it ended, and the pivots."""
     n = p.size
-    row = _start_tableau(S, p, cover, T, basic, column, place, buffer)
+    row = _start_tableau(S, p, cover, T, basic, column, place)
     leaving, pivots, ended = row, 1, CAPPED
     while pivots < cap:
         entering = leaving + n if leaving < n else leaving - n
@@ -513,7 +568,7 @@ def _prove_infeasible(S, p, cover, tolerance, T, basic, column, place, buffer, r
     At the optimum z_0 = b + u.w + v.z with u, v >= 0 holds identically in z: S'u = -v <= 0 and p.u = -b < 0.
     """
     n = p.size
-    row = _start_tableau(S, p, cover, T, basic, column, place, buffer)
+    row = _start_tableau(S, p, cover, T, basic, column, place)
     u[:] = 0.0
     for _ in range(cap):
         row = place[2 * n]
@@ -625,27 +680,45 @@ def _lemke_tolerance(attempt, single_precision):
 
 @_jit
 def _solve_range(
-    M, q, tol, single_precision, budget, warm, z_out, w_out, basis_out, residual_out, status_out, iterations_out, u_out
+    M,
+    q,
+    tol,
+    single_precision,
+    budget,
+    warm,
+    floats,
+    integers,
+    z_out,
+    w_out,
+    basis_out,
+    residual_out,
+    status_out,
+    iterations_out,
+    u_out,
 ):
-    """Run the cascade for each element; the outputs are the fields of PivotingResult."""
+    """Run the cascade for each element; the last arguments are the fields of PivotingResult."""
     B, n = z_out.shape
-    S, A, T = np.empty((n, n)), np.empty((n, n)), np.empty((n, n + 2))
-    d, e, p, cover = np.empty(n), np.empty(n + 1), np.empty(n), np.empty(n)
-    z, w, omega, x, y, v = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    buffer, basis = np.empty(n + 2), np.empty(n, dtype=np.bool_)
-    rows, cols = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-    index, basic = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-    column, place = np.empty(n + 1, dtype=np.int64), np.empty(2 * n + 1, dtype=np.int64)
+    Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
+    qs = numba.carray(_pointer(q.ctypes.data, 0.0), q.shape)
+    S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n, n + 2)
+    f = 3 * n * n + 2 * n
+    d, p, cover = _vector(floats, f, n), _vector(floats, f + n, n), _vector(floats, f + 2 * n, n)
+    z, w, omega = _vector(floats, f + 3 * n, n), _vector(floats, f + 4 * n, n), _vector(floats, f + 5 * n, n)
+    x, y, v = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 8 * n, n)
+    e, buffer = _vector(floats, f + 9 * n, n + 1), _vector(floats, f + 10 * n + 1, n + 2)
+    rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
+    basic, basis, column = _vector(integers, 3 * n, n), _vector(integers, 4 * n, n), _vector(integers, 5 * n, n + 1)
+    place = _vector(integers, 6 * n + 1, 2 * n + 1)
     for b in range(B):
-        Mb, qb = M[b if M.shape[0] > 1 else 0], q[b if q.shape[0] > 1 else 0]
-        if not (_all_finite(qb) and _all_finite(Mb.ravel())):
+        Mb, qb = Ms[b if M.shape[0] > 1 else 0], qs[b if q.shape[0] > 1 else 0]
+        if not (_all_finite(qb) and _all_finite(Mb)):
             z_out[b], w_out[b], basis_out[b] = np.nan, np.nan, False
             residual_out[b], status_out[b] = np.inf, NONFINITE_INPUT
             continue
-        if qb.min() >= 0.0:
+        if _nonnegative(qb):
             z_out[b], w_out[b], basis_out[b] = 0.0, qb, False
             continue
-        _equilibrate(Mb, T, x, d)
+        _equilibrate(Mb, A, x, d)
         s = _scale(Mb, qb, d, e, S, p)
         for i in range(n):
             basis[i] = basis_out[b, i] if warm else p[i] < 0.0
@@ -690,7 +763,7 @@ def _solve_range(
                 for i in range(n):
                     z_out[b, i] = e[i] * s * z[i] if basis[i] else 0.0
                     w_out[b, i] = 0.0 if basis[i] else max(w[i], 0.0) * s / e[i]
-                    basis_out[b, i] = basis[i]
+                    basis_out[b, i] = basis[i] != 0
             if residual <= limit:
                 status = SOLVED
                 break
@@ -702,15 +775,17 @@ def _solve_range(
 
 
 @_jit
-def _adjoint_range(M, z, basis, grad_z, grad_w, solved, grad_M, grad_q):
+def _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M, grad_q):
     """The adjoint of each element; see `solve_adjoint`."""
     B, n = z.shape
-    A, x, scratch = np.empty((n, n)), np.empty(n), np.empty(n)
-    rows, cols, index = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    A = _matrix(floats, 0, n, n)
+    x, scratch = _vector(floats, n * n, n), _vector(floats, n * n + n, n)
+    rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
+    Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
     for b in range(B):
         if not solved[b]:
             continue
-        Mb = M[b if M.shape[0] > 1 else 0]
+        Mb = Ms[b if M.shape[0] > 1 else 0]
         rank = -1
         for complete in range(2):
             k = 0
