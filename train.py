@@ -1,4 +1,7 @@
-"""Train a formulation of contact: python train.py [key=value ...]; conf/train.yaml says what can be set."""
+"""Train a formulation of contact: python train.py [key=value ...]
+
+conf/train.yaml says what can be set. HYDRA_FULL_ERROR=1 shows the whole traceback of an error.
+"""
 
 import os
 import sys
@@ -6,10 +9,12 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+DEBUGGING = os.environ.get("HYDRA_FULL_ERROR") == "1"
+MISTAKES = (HydraException, OmegaConfBaseException, ValueError, FileNotFoundError)
 CONF = Path(__file__).parent / "conf"
 TOP_LEVEL = ("seed", "threads", "batch_size", "patience", "ckpt_path", "data", "model", "loss", "optimizer", "trainer",
              "logger")  # fmt: skip
@@ -18,6 +23,15 @@ TOP_LEVEL = ("seed", "threads", "batch_size", "patience", "ckpt_path", "data", "
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> float:
     """Build what the configuration says, train and test it; return the best validation loss, for sweepers."""
+    try:
+        return train(config)
+    except (*MISTAKES, KeyboardInterrupt) as error:
+        if DEBUGGING:
+            raise
+        sys.exit(sentence(error))  # no Exception, so that Hydra adds nothing to it
+
+
+def train(config: DictConfig) -> float:
     from lcplearn.training.settings import check
 
     run = HydraConfig.get()
@@ -41,8 +55,8 @@ def main(config: DictConfig) -> float:
         result = fit(
             model,
             data,
-            loss={name: weight for name, weight in loss.items() if name != "horizon"},
-            horizon=loss["horizon"],
+            horizon=loss.pop("horizon"),
+            loss=loss,
             epochs=trainer.pop("max_epochs"),
             batch_size=config.batch_size,
             optimizer=hydra.utils.instantiate(config.optimizer, _convert_="all"),
@@ -55,29 +69,27 @@ def main(config: DictConfig) -> float:
             settings=settings,
         )
     except TrainingInterrupted as stop:
-        command = " ".join(["python", *sys.argv[:1], *run.overrides.task])
-        raise KeyboardInterrupt(f"Stopped. To go on: {command} ckpt_path={stop.checkpoint}") from None
+        overrides = [override for override in run.overrides.task if not override.startswith("ckpt_path=")]
+        command = " ".join(["python train.py", *overrides, f"ckpt_path={os.path.relpath(stop.checkpoint)}"])
+        raise KeyboardInterrupt(f"Stopped; to go on: {command}") from None
     if result.metrics is not None:
         print(f"\n{format_table(result.metrics)}\n\nrun folder: {os.path.relpath(result.folder)}")
     return result.validation
 
 
-def sentence(error: Exception) -> str:
+def sentence(error: BaseException) -> str:
     """What a user can do about an error, in one sentence."""
     from lcplearn.training.settings import explain
 
-    cause = error.__cause__ if isinstance(error, HydraException) and isinstance(error.__cause__, Exception) else error
-    return explain(str(cause), CONF)
+    failed_call = isinstance(error, InstantiationException) and error.__cause__ is not None
+    return explain(str(error.__cause__ if failed_call else error) or "Stopped.", CONF)
 
 
 if __name__ == "__main__":
-    debugging = os.environ.get("HYDRA_FULL_ERROR", "0") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
     try:
         main()
-    except KeyboardInterrupt as stop:
-        sys.exit(f"\n{stop}" if str(stop) else 130)
-    except (HydraException, OmegaConfBaseException, ValueError, FileNotFoundError) as error:
-        if debugging:
+    except MISTAKES as error:
+        if DEBUGGING:
             raise
-        sys.exit(f"{sentence(error)}\n(HYDRA_FULL_ERROR=1 shows where.)")
+        sys.exit(sentence(error))

@@ -6,13 +6,14 @@ import torch
 from torch import Tensor
 
 from lcplearn.formulations import Formulation
+from lcplearn.formulations.formulation import STICK_SPEED
 from lcplearn.training.metrics import rollout, truth, valid_steps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TRUE, LEARNED = {"color": "black", "linewidth": 2.5, "alpha": 0.35}, {"color": "tab:red", "linewidth": 1.4}
+TRUE, LEARNED = {"color": "black", "linewidth": 5.0, "alpha": 0.25}, {"color": "tab:red", "linewidth": 1.4}
 
 
 def draw(model: Formulation, data: Any) -> dict[str, "Figure"]:
@@ -47,7 +48,7 @@ def one_step_map(model: Formulation, data: Any, speeds: tuple[float, ...] = (-0.
             p, c = speed + force * data.dt / mass, data.mu * data.gravity * data.dt
             exact = p.sign() * (p.abs() - c).clamp(min=0.0)
             ax.plot(force, exact, color=colour, linewidth=5, alpha=0.25)
-        ax.plot(force, after, color=colour, linewidth=1.4, label=f"from {speed:+.1f} m/s")
+        ax.plot(force, after, color=colour, linewidth=1.4, label=f"from {speed:+.1f} m/s" if speed else "from rest")
     if data.mu is not None:
         ax.axvspan(-limit, limit, color="0.9", zorder=0, label="sticks from rest")
     ax.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
@@ -59,23 +60,33 @@ def one_step_map(model: Formulation, data: Any, speeds: tuple[float, ...] = (-0.
 
 
 def rollouts(model: Formulation, data: Any, count: int = 3) -> "Figure":
-    """Velocity of the first test recordings, predicted from their start, with the shares at rest shaded."""
-    figure, axes = _figure(count, 1, (8.0, 1.9 * count + 0.6))
-    test = _first(data.test, count)
+    """Velocity of a few test recordings, predicted from their start; strips below show when the block rests."""
+    figure, axes = _figure(count, 1, (8.0, 2.1 * count + 0.6))
+    chosen = torch.linspace(0, len(data.test.steps) - 1, count).long()  # those from rest come first
+    test = type(data.test)(*(None if field is None else field[chosen] for field in data.test))
     _, velocity = rollout(model, test)
-    true = truth(test)
+    true, name = truth(test), "recorded" if data.kind == "cube_slides" else "true"
     for row, ax in enumerate(ax for line in axes for ax in line):
         steps = int(test.steps[row])
         time = torch.arange(steps + 1) * data.dt
-        ax.plot(time, true[row, : steps + 1], label="recorded" if data.kind == "cube_slides" else "true", **TRUE)
+        ax.plot(time, true[row, : steps + 1], label=name, **TRUE)
         ax.plot(time, _shown(velocity[row, : steps + 1], true[row]), label="rolled out from the start", **LEARNED)
-        still = (velocity[row, 1 : steps + 1].abs() < 1e-12).double()
-        ax.fill_between(time[1:], 0, 1, where=still > 0, transform=ax.get_xaxis_transform(), color="0.88", zorder=0,
-                        label="predicted at rest")
-        ax.set_ylabel("v [m/s]")
+        low, high = ax.get_ylim()
+        ax.set(ylim=(low - 0.22 * (high - low), high), ylabel="velocity [m/s]")
+        _strip(ax, time, true[row, : steps + 1], 0.01, "black", f"{name} at rest", alpha=0.35)
+        _strip(ax, time, velocity[row, : steps + 1], 0.08, "tab:red", "predicted at rest")
     axes[-1][0].set_xlabel("time [s]")
-    axes[0][0].legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    axes[0][0].legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     return figure
+
+
+def _strip(ax: "Axes", time: Tensor, velocity: Tensor, bottom: float, colour: str, label: str, alpha: float = 1.0) -> None:
+    """Mark the steps after which the block rests, at a height given in parts of the axes."""
+    still, dt = velocity[1:].abs() < STICK_SPEED, float(time[1] - time[0])
+    spans = [(float(start), dt) for start in time[:-1][still]] or [(0.0, 0.0)]
+    ax.broken_barh(
+        spans, (bottom, 0.05), facecolors=colour, alpha=alpha, linewidth=0, transform=ax.get_xaxis_transform(), label=label
+    )
 
 
 def error_over_horizon(model: Formulation, data: Any) -> "Figure":
@@ -103,10 +114,6 @@ def _shown(velocity: Tensor, true: Tensor) -> Tensor:
     """Hide what has left the picture, so that a diverged rollout doesn't flatten the truth."""
     reach = 3.0 * true.abs().max().clamp(min=1e-3)
     return torch.where(velocity.abs() <= reach, velocity, torch.nan)
-
-
-def _first(recordings: Any, count: int) -> Any:
-    return type(recordings)(*(None if field is None else field[:count] for field in recordings))
 
 
 def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", list[list["Axes"]]]:

@@ -13,6 +13,10 @@ from lcplearn.training.checkpoint import describe
 from lcplearn.training.optimizer import Optimizer
 
 
+# torch's LBFGS learns curvature only from steps with y.s > 1e-10, an absolute number: losses of 1e-12 need enlarging.
+LBFGS_SCALE = 1e8
+
+
 class FormulationModule(pl.LightningModule):
     """Train a formulation.
 
@@ -49,16 +53,17 @@ class FormulationModule(pl.LightningModule):
     def training_step(self, windows: Windows, index: int) -> None:
         finishes = self.optimizer.finishes(self.current_epoch)
         active = self._optimizers()[-1 if finishes else 0]
+        scale = LBFGS_SCALE if finishes else 1.0
         report: dict[str, Tensor] = {}
 
         def closure() -> Tensor:
             active.zero_grad()
             terms = self._terms(windows)
             total = self._total(terms)
-            self.manual_backward(total)
+            self.manual_backward(scale * total)
             report.update({name: term.detach() for name, term in terms.items()}, total=total.detach())
             # All processes must see one loss, or their line searches part ways.
-            return self.trainer.strategy.reduce(total.detach(), reduce_op="mean") if finishes else total.detach()
+            return scale * self.trainer.strategy.reduce(total.detach(), reduce_op="mean")
 
         active.step(closure=closure)
         # A scalar costs 0.5 ms to log: only those that are shown are.

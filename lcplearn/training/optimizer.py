@@ -26,7 +26,7 @@ class Optimizer:
     Source: learning.md B1; B2 (gradient plateau).
     """
 
-    lr: float = 3e-2
+    lr: float = 5e-2
     lbfgs_after: int | None = None
     lbfgs_iterations: int = 10
     anneal_epochs: int = 0

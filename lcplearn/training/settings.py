@@ -35,6 +35,7 @@ def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool =
     """
     for key in settings:
         _known(key, known, "setting")
+    _check_friction(settings)
     for group in ("data", "model", "optimizer", "logger"):
         if settings.get(group) is not None:
             _check_target(group, settings[group])
@@ -48,6 +49,16 @@ def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool =
     if multirun and strategy.startswith("ddp") and not strategy.startswith(("ddp_fork", "ddp_spawn")):
         raise SettingsError(f"A sweep (-m) can't run with trainer.strategy={strategy}: use trainer.strategy=ddp_fork.")
     _check_checkpoint(settings.get("ckpt_path"))
+
+
+def _check_friction(settings: Mapping[str, Any]) -> None:
+    """Models of known friction learn from labels that only simulations have."""
+    model, data = (str(settings[group].get("_target_")).rpartition(".")[2] for group in ("model", "data"))
+    if model in ("Direct", "Slack") and not settings["data"].get("friction"):
+        kinds = "slack" if model == "Slack" else "physical or data.friction=lcp"
+        raise SettingsError(f"model={model.lower()} needs friction labels: set data.friction={kinds}.")
+    if "friction" in settings["data"] and not data.startswith("simulate_"):
+        raise SettingsError(f"model={model.lower()} needs friction labels, which only data=sliding_block has.")
 
 
 def _check_loss(loss: Mapping[str, Any]) -> None:
@@ -173,13 +184,14 @@ def explain(message: str, conf: Path) -> str:
             return f"'{unknown[1]}' is not set in conf/{group}; to add it, write +{unknown[1]}=..."
         prefix = f"{group}." if group else ""
         return f"Unknown setting '{unknown[1]}'; {_suggestion(key, in_files | in_code, prefix)}"
-    return " ".join(message.split())
+    return " ".join(message.split())  # Hydra breaks its lines
 
 
 def _vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:
     """Keys of a group's files, and those that its targets accept besides."""
     files = list((conf / group).glob("*.yaml")) if group else [conf / "train.yaml"]
     contents = [yaml.safe_load(file.read_text()) or {} for file in files]
+    contents = [content.get(group, content) for content in contents]  # files of package _global_ name their group
     in_files = {key for content in contents for key in content if not key.startswith("_")} - {"defaults"}
     if not group:
         return in_files | {folder.name for folder in conf.iterdir() if folder.is_dir()}, set()
