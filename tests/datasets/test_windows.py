@@ -121,3 +121,13 @@ def test_a_wrong_argument_is_named(name, arguments):
         WindowLoader(numbered(3), **arguments)
     with pytest.raises(ValueError, match=r"^windows: expected at least one window, got none"):
         WindowLoader(numbered(0))
+
+
+def test_the_process_group_says_which_shard_is_ours(monkeypatch):
+    """The group may start after the loader was made, as it does in Lightning."""
+    loader = WindowLoader(numbered(5), shuffle=False)
+    assert drawn(loader) == [[0, 1, 2, 3, 4]]
+    for name, value in (("is_initialized", True), ("get_rank", 1), ("get_world_size", 2)):
+        monkeypatch.setattr(torch.distributed, name, lambda value=value: value)
+    assert drawn(loader) == [[1, 3, 0]]
+    assert len(loader) == 1
