@@ -69,7 +69,7 @@ class FrictionLCP(Formulation):
 class Structured(FrictionLCP):
     """Learn b, a and c of the friction LCP, each affine, constant or a network.
 
-    b = b_v v + b_u u + b_0 (or v + net(v, u dt)),   a = exp(log a),   c = exp(log c) (or exp(log c + net(v)))
+    b = b_v v + b_u u + b_0 (+ net(v, u dt)),   a = exp(log a),   c = exp(log c) (or exp(log c + net(v)))
 
     Only the product a c has an effect on the motion. Read-outs: mass = dt / b_u and mu = a c / (g dt).
 
@@ -79,7 +79,9 @@ class Structured(FrictionLCP):
         initial_mu: Friction coefficient at the start; > 0. Well below the expected one: if no sample is predicted to
             slip, the prediction loss has no gradient.
         initial_mass: Mass at the start [kg]; > 0.
-        b_network: Learn the free velocity by a network.
+        learn_b: False keeps b = v + u dt / initial_mass: what changes the velocity is then friction alone, and a block
+            at rest stays there.
+        b_network: Add a network of (v, u dt) to the affine free velocity.
         c_network: Learn the impulse limit by a network of the velocity.
         width: Units of the networks' hidden layers.
         depth: Hidden layers of the networks.
@@ -92,6 +94,7 @@ class Structured(FrictionLCP):
         gravity: float = 9.81,
         initial_mu: float = 0.1,
         initial_mass: float = 1.0,
+        learn_b: bool = True,
         b_network: bool = False,
         c_network: bool = False,
         width: int = 64,
@@ -103,6 +106,8 @@ class Structured(FrictionLCP):
         self.log_c = log_parameter("initial_mu", mu * mass * gravity * dt)
         self.b_weight = nn.Parameter(torch.tensor([1.0, 1.0 / mass], dtype=torch.float64))
         self.b_bias = nn.Parameter(torch.zeros((), dtype=torch.float64))
+        self.b_weight.requires_grad_(learn_b)
+        self.b_bias.requires_grad_(learn_b)
         self.b_net = network(2, 1, width=width, depth=depth, activation="tanh") if b_network else None
         self.c_net = network(1, 1, width=width, depth=depth, activation="tanh") if c_network else None
 
@@ -124,7 +129,7 @@ class Structured(FrictionLCP):
         values = {}
         if self.c_net is None:
             values["mu"] = (self.log_a + self.log_c).exp().item() / (self.gravity * self.dt)
-        if self.b_net is None:
+        if self.b_net is None and self.b_weight.requires_grad:
             values["mass"] = 1.0 / self.b_weight[1].item()
         return values
 
