@@ -366,6 +366,22 @@ def _judge(q, p, d, e, s, z, w, omega, tol):
     return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))
 
 
+@_jit
+def _drop_noise(z, w, omega, S, tol):
+    """Zero what is rounding noise in rows that hold nothing else: there w / omega says nothing; whether any was."""
+    n = z.size
+    z_size, dropped = 0.0, False
+    for i in range(n):
+        z_size = max(z_size, z[i])
+    for i in range(n):
+        if omega[i] <= 1e-12 * z_size and abs(w[i]) > tol * omega[i]:
+            for j in range(n):
+                if S[i, j] != 0.0 and 0.0 < z[j] <= 1e-12 * z_size:
+                    z[j] = 0.0
+                    dropped = True
+    return dropped
+
+
 # --- refinement and block pivoting ----------------------------------------------------------------------------------
 
 
@@ -758,6 +774,9 @@ def _solve_range(
             if stage == 0 and ended != DONE:
                 continue
             residual, limit = _judge(qb, p, d, e, s, z, w, omega, tol)
+            if residual > limit and _drop_noise(z, w, omega, S, tol):
+                _evaluate(S, p, z, w, omega)
+                residual, limit = _judge(qb, p, d, e, s, z, w, omega, tol)
             if residual < best or best == np.inf:
                 best = residual
                 for i in range(n):
