@@ -21,7 +21,7 @@ block pivoting; Mehrotra (1992) for the predictor-corrector steps; Ruiz (2001) f
 import os
 import sys
 from collections.abc import Callable
-from math import sqrt
+from math import frexp, ldexp, sqrt
 from typing import Any, NamedTuple
 
 import numba
@@ -34,7 +34,7 @@ EPS = 2.220446049250313e-16
 SOLVED, INFEASIBLE, UNSOLVED, MAX_ITERATIONS, NONFINITE_INPUT = 0, 1, 2, 3, 4  # solution.Status, as plain constants
 DONE, STUCK, CAPPED = 0, 1, 2  # how a stage ended
 _EXPONENT = 0x7FF0000000000000  # bits of a double that remain when it is rounded down to a power of two
-_LEMKE_TRIES = 3
+_LARGEST = 1.7976931348623157e308
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
@@ -310,21 +310,40 @@ def _equilibrate(M, size, largest, d):
 
 
 @_jit
-def _scale(M, q, d, e, S, p):
-    """S = E M E and p = E q / s, without rounding: E and s are powers of two; returns s."""
+def _rescale(M, r, c):
+    """Improve r and c by Ruiz sweeps of rows and columns apart: not a congruence, but it keeps solutions and P."""
+    n = r.size
+    for _ in range(2 * RUIZ_SWEEPS):
+        for side in range(2):
+            for i in range(n):
+                largest = 0.0
+                for j in range(n):
+                    largest = max(largest, abs(M[i, j] * c[j]) * r[i] if side == 0 else abs(r[j] * M[j, i]) * c[i])
+                if largest > 0.0 and side == 0:
+                    r[i] /= largest
+                elif largest > 0.0:
+                    c[i] /= largest
+
+
+@_jit
+def _scale(M, q, r, c, S, p):
+    """S = R M C and p = R q / s without rounding, as r, c and s become powers of two; returns s.
+
+    A solution z', w' for S and p is z = s C z', w = s R^-1 w' for M and q.
+    """
     n = q.size
-    e[n] = 0.0
-    bits = e.view(np.int64)
+    row_bits, column_bits = r.view(np.int64), c.view(np.int64)
+    s = 0.0
     for i in range(n):
-        e[i] = d[i]
-        bits[i] &= _EXPONENT
-        e[n] = max(e[n], abs(e[i] * q[i]))
-    bits[n] &= _EXPONENT
-    s = e[n]
+        row_bits[i] &= _EXPONENT
+        column_bits[i] &= _EXPONENT
+        s = max(s, abs(r[i] * q[i]))
+    s = ldexp(0.5, frexp(s)[1])
     for i in range(n):
-        p[i] = e[i] * q[i] / s
+        ri = r[i]
+        p[i] = ri * q[i] / s
         for j in range(n):
-            S[i, j] = e[i] * M[i, j] * e[j]
+            S[i, j] = ri * M[i, j] * c[j]
     return s
 
 
@@ -343,25 +362,25 @@ def _evaluate(S, p, z, w, omega):
 
 
 @_jit
-def _judge(q, p, d, e, s, z, w, omega, tol):
+def _judge(q, p, d, r, c, s, z, w, omega, tol):
     """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
     n = q.size
     z_size = 0.0
     for i in range(n):
-        z_size = max(z_size, e[i] * z[i])
+        z_size = max(z_size, c[i] * z[i])
     natural, q_size, rows, absMz, absq, total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
-        f = d[i] / e[i]
-        natural = max(natural, abs(min(z[i] / f, w[i] * f)))
+        f = d[i] / r[i]
+        natural = max(natural, abs(min(c[i] * z[i] / d[i], w[i] * f)))
         q_size = max(q_size, f * abs(p[i]))
-        z_share = e[i] * z[i] / z_size if z[i] > 0.0 else 0.0
+        z_share = c[i] * z[i] / z_size if z[i] > 0.0 else 0.0
         w_share = w[i] / omega[i] if w[i] != 0.0 else 0.0
         rows = max(rows, abs(min(z_share, w_share)))
-        absMz = max(absMz, (omega[i] - abs(p[i])) / e[i])
+        absMz = max(absMz, (omega[i] - abs(p[i])) / r[i])
         absq = max(absq, abs(q[i]))
-        total += abs(w[i]) + e[i] * s * z[i]
+        total += abs(w[i]) + c[i] * s * z[i]
     residual = max(natural / q_size, rows)
-    if not total <= 1.7976931348623157e308:
+    if not total <= _LARGEST:
         residual = np.inf
     return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))
 
@@ -680,18 +699,90 @@ def _interior_point(S, p, A, rows, cols, z, w, omega, r, dz, dw, scratch, cap):
 
 
 @_jit
-def _covering_vector(attempt, cover):
-    """Ones, and for another attempt an irregular positive vector: another path, without the old ray or cycle."""
+def _prepare_lemke(stage, single_precision, cover):
+    """Fill the covering vector and return the smallest pivot of a try: the size of the data's precision first.
+
+    The second try has an irregular vector: another path, without the old ray or cycle.
+    """
     for i in range(cover.size):
-        cover[i] = 1.0 if attempt != 1 else 1.0 + (0.6180339887498949 * (i + 1)) % 1.0
+        cover[i] = 1.0 + (0.6180339887498949 * (i + 1)) % 1.0 if stage == 2 else 1.0
+    if stage == 1 or stage == 5:
+        return 1e-6 if single_precision else 1e-9
+    if stage == 2:
+        return 1e-4 if single_precision else 1e-7
+    return 1e-9 if single_precision else 1e-12
 
 
 @_jit
-def _lemke_tolerance(attempt, single_precision):
-    """Smallest pivot: the size of the data's precision first."""
-    if single_precision:
-        return 1e-6 if attempt == 0 else (1e-4 if attempt == 1 else 1e-9)
-    return 1e-9 if attempt == 0 else (1e-7 if attempt == 1 else 1e-12)
+def _solve_one(
+    M, q, tol, single_precision, budget, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
+    rows, cols, index, basic, basis, column, place, z_out, w_out, basis_out, u_out
+):  # fmt: skip
+    """Run the cascade for one finite element with some q_i < 0; status, residual and iterations. Stages:
+
+    0 block pivoting; 1, 2, 3 Lemke's method; 4, 5 both with rows and columns scaled apart; 6 interior point. What is
+    infeasible is found out when Lemke's method first ends on a ray.
+    """
+    n = q.size
+    best, used, capped, asked = np.inf, 0, False, False
+    s = _scale(M, q, r, c, S, p)
+    stage = -1
+    while stage < 6:
+        stage = 6 if capped else stage + 1
+        left = budget - used if budget >= 0 else 20 * n + 100
+        if left <= 0:
+            capped = True
+            break
+        if stage == 4:
+            _rescale(M, r, c)
+            s = _scale(M, q, r, c, S, p)
+        if stage == 0 or stage == 4:
+            if stage == 4:
+                for i in range(n):
+                    basis[i] = p[i] < 0.0
+            ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, y, min(20, left))
+        elif stage < 6:
+            pivot = _prepare_lemke(stage, single_precision, cover)
+            cap = left if budget >= 0 else 10 * n + 50
+            ended, count = _lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
+            capped = ended == CAPPED
+            _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
+        else:
+            for i in range(n):
+                r[i] = c[i] = d[i]
+            s = _scale(M, q, r, c, S, p)
+            ended = DONE
+            count = _interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, min(80, left))
+            for i in range(n):
+                basis[i] = z[i] > w[i]
+            _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
+        used += count
+        if (stage == 0 or stage == 4) and ended != DONE:
+            continue
+        residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
+        if residual > limit and _drop_noise(z, w, omega, S, tol):
+            _evaluate(S, p, z, w, omega)
+            residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
+        if residual < best:
+            best = residual
+            for i in range(n):
+                z_out[i] = c[i] * s * z[i] if basis[i] else 0.0
+                w_out[i] = 0.0 if basis[i] else max(w[i], 0.0) * s / r[i]
+                basis_out[i] = basis[i] != 0
+        if residual <= limit:
+            return SOLVED, residual, used
+        if not asked and (ended == STUCK or stage == 6):
+            asked = True
+            cover[:] = 1.0
+            if _prove_infeasible(S, p, cover, 1e-11, T, basic, column, place, buffer, x, index, v, 20 * n + 50):
+                largest = 0.0
+                for i in range(n):
+                    u_out[i] = r[i] * v[i]
+                    largest = max(largest, u_out[i])
+                for i in range(n):
+                    u_out[i] /= largest
+                return INFEASIBLE, best, used
+    return (MAX_ITERATIONS if capped else UNSOLVED), best, used
 
 
 @_jit
@@ -721,7 +812,10 @@ def _solve_range(
     d, p, cover = _vector(floats, f, n), _vector(floats, f + n, n), _vector(floats, f + 2 * n, n)
     z, w, omega = _vector(floats, f + 3 * n, n), _vector(floats, f + 4 * n, n), _vector(floats, f + 5 * n, n)
     x, y, v = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 8 * n, n)
-    e, buffer = _vector(floats, f + 9 * n, n + 1), _vector(floats, f + 10 * n + 1, n + 2)
+    r, c, buffer = _vector(floats, f + 9 * n, n), _vector(floats, f + 10 * n, n), _vector(floats, f + 11 * n, n + 2)
+    zs = numba.carray(_pointer(z_out.ctypes.data, 0.0), z_out.shape)
+    ws = numba.carray(_pointer(w_out.ctypes.data, 0.0), w_out.shape)
+    us = numba.carray(_pointer(u_out.ctypes.data, 0.0), u_out.shape)
     rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
     basic, basis, column = _vector(integers, 3 * n, n), _vector(integers, 4 * n, n), _vector(integers, 5 * n, n + 1)
     place = _vector(integers, 6 * n + 1, 2 * n + 1)
@@ -734,63 +828,16 @@ def _solve_range(
         if _nonnegative(qb):
             z_out[b], w_out[b], basis_out[b] = 0.0, qb, False
             continue
+        z_out[b], w_out[b] = 0.0, 0.0  # in case no stage has a candidate
         _equilibrate(Mb, A, x, d)
-        s = _scale(Mb, qb, d, e, S, p)
         for i in range(n):
-            basis[i] = basis_out[b, i] if warm else p[i] < 0.0
-        best, used, status, capped = np.inf, 0, UNSOLVED, False
-        for stage in range(_LEMKE_TRIES + 2):
-            left = budget - used if budget >= 0 else -1
-            if left == 0:
-                capped = True
-                break
-            if stage == 0:
-                cap = 20 if left < 0 else min(20, left)
-                ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, y, cap)
-            elif stage <= _LEMKE_TRIES:
-                _covering_vector(stage - 1, cover)
-                pivot_tol = _lemke_tolerance(stage - 1, single_precision)
-                cap = 10 * n + 50 if left < 0 else left
-                ended, count = _lemke(
-                    S, p, cover, pivot_tol, T, basic, column, place, buffer, x, index, basis, z, cap
-                )
-                capped = capped or ended == CAPPED
-                _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
-            else:
-                cover[:] = 1.0
-                if _prove_infeasible(
-                    S, p, cover, 1e-11, T, basic, column, place, buffer, x, index, v, 20 * n + 50
-                ):
-                    status = INFEASIBLE
-                    u_out[b] = e[:n] * v / (e[:n] * v).max()
-                    break
-                cap = 80 if left < 0 else min(80, left)
-                count = _interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, cap)
-                ended = DONE
-                for i in range(n):
-                    basis[i] = z[i] > w[i]
-                _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
-            used += count
-            if stage == 0 and ended != DONE:
-                continue
-            residual, limit = _judge(qb, p, d, e, s, z, w, omega, tol)
-            if residual > limit and _drop_noise(z, w, omega, S, tol):
-                _evaluate(S, p, z, w, omega)
-                residual, limit = _judge(qb, p, d, e, s, z, w, omega, tol)
-            if residual < best or best == np.inf:
-                best = residual
-                for i in range(n):
-                    z_out[b, i] = e[i] * s * z[i] if basis[i] else 0.0
-                    w_out[b, i] = 0.0 if basis[i] else max(w[i], 0.0) * s / e[i]
-                    basis_out[b, i] = basis[i] != 0
-            if residual <= limit:
-                status = SOLVED
-                break
-        if best == np.inf and capped:
-            z_out[b], w_out[b], basis_out[b] = 0.0, qb, False
-        if status == UNSOLVED and capped:
-            status = MAX_ITERATIONS
-        residual_out[b], status_out[b], iterations_out[b] = best, status, used
+            r[i] = c[i] = d[i]
+            basis[i] = basis_out[b, i] if warm else qb[i] < 0.0
+            basis_out[b, i] = False
+        status_out[b], residual_out[b], iterations_out[b] = _solve_one(
+            Mb, qb, tol, single_precision, budget, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
+            rows, cols, index, basic, basis, column, place, zs[b], ws[b], basis_out[b], us[b]
+        )  # fmt: skip
 
 
 @_jit
