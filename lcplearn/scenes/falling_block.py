@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.lcp.solve import solve_lcp
+from lcplearn.scenes.checks import require_positive
 from lcplearn.scenes.rollout import Mode, Trajectory, rollout
 
 
@@ -30,6 +31,9 @@ class FallingBlock:
     mass: float | Tensor
     dt: float
     gravity: float | Tensor = 9.81
+
+    def __post_init__(self) -> None:
+        require_positive(mass=self.mass, dt=self.dt)
 
     def lcp(
         self, gap: Float[Tensor, "*#batch"], velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
@@ -99,6 +103,11 @@ class BouncingBlock:
     restitution: float | Tensor
     dt: float
     gravity: float | Tensor = 9.81
+
+    def __post_init__(self) -> None:
+        require_positive(mass=self.mass, dt=self.dt)
+        if not isinstance(self.restitution, Tensor) and not 0 <= self.restitution <= 1:
+            raise ValueError(f"restitution: expected a number from 0 to 1, got {self.restitution}")
 
     def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step in contact: M [*#batch, 1, 1], q [*batch, 1], from velocity [m/s] and force [N]."""

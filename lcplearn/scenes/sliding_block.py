@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lcplearn.lcp.solve import solve_lcp
+from lcplearn.scenes.checks import require_positive
 from lcplearn.scenes.rollout import Mode, Trajectory, rollout
 
 Form = Literal["direct", "physical", "traditional"]
@@ -56,8 +57,7 @@ class OneWayBlock:
     gravity: float = 9.81
 
     def __post_init__(self) -> None:
-        _require_positive("dt", self.dt)
-        _require_positive("mass", self.mass)
+        require_positive(mass=self.mass, dt=self.dt)
 
     def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step.
@@ -132,8 +132,7 @@ class SlidingBlock:
     form: Form = "direct"
 
     def __post_init__(self) -> None:
-        _require_positive("dt", self.dt)
-        _require_positive("mass", self.mass)
+        require_positive(mass=self.mass, dt=self.dt)
         if self.form not in ("direct", "physical", "traditional"):
             raise ValueError(f"form: expected 'direct', 'physical' or 'traditional', got {self.form!r}")
 
@@ -202,8 +201,3 @@ def _matrix(factor: float | Tensor, pattern: list[list[float]], like: Tensor) ->
     """factor [*batch] times a constant matrix, in the dtype and on the device of like."""
     constant = torch.tensor(pattern, dtype=like.dtype, device=like.device)
     return factor[..., None, None] * constant if isinstance(factor, Tensor) else factor * constant
-
-
-def _require_positive(name: str, value: float | Tensor) -> None:
-    if not bool((torch.as_tensor(value) > 0).all()):
-        raise ValueError(f"{name}: expected positive, got {value}")

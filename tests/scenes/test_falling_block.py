@@ -141,3 +141,17 @@ def test_each_scene_has_one_row():
     for M, q in (FallingBlock(1.0, 0.1).lcp(zero, zero, zero), BouncingBlock(1.0, 0.5, 0.1).lcp(zero, zero)):
         assert M.shape[-2:] == (1, 1)
         assert q.shape == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("dt", lambda: FallingBlock(1.0, 0.0)),
+        ("mass", lambda: FallingBlock(-1.0, 0.1)),
+        ("dt", lambda: BouncingBlock(1.0, 0.5, -0.1)),
+        ("restitution", lambda: BouncingBlock(1.0, 1.5, 0.1)),
+    ],
+)
+def test_a_wrong_argument_is_named(name, make):
+    with pytest.raises(ValueError, match=f"^{name}: expected a .*number.*, got"):
+        make()
