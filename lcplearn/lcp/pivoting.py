@@ -75,7 +75,7 @@ def solve_batch(
     """Solve B LCPs; each element's result is independent of its neighbours, bit by bit.
 
     Args:
-        M: float64 [B, n, n], or [1, n, n] shared by the batch; C-contiguous; never written to.
+        M: float64 [B, n, n], or [1, n, n] shared by the batch; not copied if C-contiguous, never written to.
         q: float64 [B, n], or [1, n] shared by the batch; likewise.
         single_precision: the data were rounded to float32, so pivots below 1e-6 are noise and the tolerance is 2e-6.
         max_iter: pivots and interior-point steps allowed to an element; None lets each stage choose.
@@ -102,11 +102,9 @@ def solve_batch(
     if tol is None:
         tol = 2e-6 if single_precision else 1e-10
     _announce_compilation()
-    # numba compiles a second kernel for read-only arrays; they are rare (torch gives none), so copy instead
-    M = M if M.flags.writeable else M.copy()
-    q = q if q.flags.writeable else q.copy()
+    M, q = _plain(M), _plain(q)
     budget = -1 if max_iter is None else max_iter
-    floats, integers = np.empty(3 * n * n + 16 * n), np.empty(9 * n, dtype=np.int64)  # scratch
+    floats, integers = np.empty(3 * n * n + 14 * n + 2), np.empty(8 * n + 2, dtype=np.int64)  # scratch
     _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, floats, integers, *result)
     return result
 
@@ -139,11 +137,20 @@ def solve_adjoint(
     grad_q = np.zeros(z.shape)
     grad_M = np.zeros(M.shape if need_M else (0, 0, 0))
     if grad_q.size:
-        M = M if M.flags.writeable else M.copy()
+        M, z, grad_z, grad_w = _plain(M), _plain(z), _plain(grad_z), _plain(grad_w)
         n = z.shape[-1]
         floats, integers = np.empty(n * n + 2 * n), np.empty(3 * n, dtype=np.int64)  # scratch
         _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M, grad_q)
     return (grad_M if need_M else None), grad_q
+
+
+def _plain(array: np.ndarray) -> np.ndarray:
+    """The same array where it is already C-contiguous float64 and writable, as torch's are; else a copy.
+
+    The kernel reads bare memory, and numba would compile a second kernel for read-only arrays.
+    """
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    return array if array.flags.writeable else array.copy()
 
 
 def _announce_compilation() -> None:
