@@ -35,10 +35,13 @@ RANK_TOLERANCES = {torch.float64: (1e-15, 1e-9), torch.float32: (1e-7, 1e-5)}
 
 
 class DifferentiableSolve(torch.autograd.Function):
-    """Run `solve(M, q, initial_basis)` and give z and w of its solution their implicit derivative."""
+    """Run `solve(M, q, initial_basis)` and give z and w of its solution their implicit derivative.
+
+    M is [*batch, n, n], or [n, n] shared by the batch of q [*batch, n]; its gradient is then the sum over the batch.
+    """
 
     @staticmethod
-    def forward(M: Tensor, q: Tensor, initial_basis: Tensor | None, solve: ForwardSolve, smoothed: bool) -> Any:  # type: ignore[override]
+    def forward(M: Tensor, q: Tensor, initial_basis: Tensor | None, solve: ForwardSolve, smoothed: bool) -> Any:
         return tuple(solve(M, q, initial_basis))
 
     @staticmethod
@@ -59,12 +62,14 @@ class DifferentiableSolve(torch.autograd.Function):
         g_z = torch.zeros_like(z) if grad_z is None else torch.where(solved, grad_z, 0.0)
         g_w = torch.zeros_like(w) if grad_w is None else torch.where(solved, grad_w, 0.0)
         z = torch.where(solved, z, 0.0)
-        damping = _damping(z, w, solved, ctx.smoothed)
         h_I = torch.where(basis, 0.0, g_w)
-        rhs = damping * g_w - g_z - (M.mT @ h_I.unsqueeze(-1)).squeeze(-1)
-        h_A = basis_solve(M.mT + torch.diag_embed(damping), basis & solved, rhs)
-        grad_q = torch.where(basis, h_A, h_I)
-        grad_M = grad_q.unsqueeze(-1) * z.unsqueeze(-2) if ctx.needs_input_grad[0] else None
+        rhs = -g_z - (M.mT @ h_I.unsqueeze(-1)).squeeze(-1)
+        K = M.mT
+        if ctx.smoothed:
+            damping = _damping(z, w, solved)
+            K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
+        grad_q = torch.where(basis, basis_solve(K, basis & solved, rhs), h_I)
+        grad_M = (grad_q.unsqueeze(-1) * z.unsqueeze(-2)).sum_to_size(M.shape) if ctx.needs_input_grad[0] else None
         return grad_M, grad_q if ctx.needs_input_grad[1] else None, None, None, None
 
     @staticmethod
@@ -75,22 +80,28 @@ class DifferentiableSolve(torch.autograd.Function):
         e = torch.zeros_like(z) if dq is None else torch.where(solved, dq, 0.0)
         if dM is not None:
             e = e + torch.where(solved, (dM @ z.unsqueeze(-1)).squeeze(-1), 0.0)
-        damping = _damping(z, w, solved, ctx.smoothed)
-        dz = basis_solve(M + torch.diag_embed(damping), basis & solved, -e)
-        dw = torch.where(basis & solved, -damping * dz, e + (M @ dz.unsqueeze(-1)).squeeze(-1))
+        K = M + torch.diag_embed(_damping(z, w, solved)) if ctx.smoothed else M
+        dz = basis_solve(K, basis & solved, -e)
+        dw = e + (M @ dz.unsqueeze(-1)).squeeze(-1)
+        if not ctx.smoothed:
+            dw = torch.where(basis, 0.0, dw)
         return dz, torch.where(solved, dw, 0.0), None, None, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, M: Tensor, q: Tensor, initial_basis: Tensor | None, solve: Any, smoothed: bool) -> Any:
-        M, q = (_batch_first(x, dim, info.batch_size) for x, dim in zip((M, q), in_dims, strict=False))
+        if in_dims[0] is not None or M.dim() > 2:
+            M = _batch_first(M, in_dims[0], info.batch_size)
+        q = _batch_first(q, in_dims[1], info.batch_size)
+        if M.dim() == 3 and q.dim() > 2:  # one shared matrix for each element that vmap sees
+            M = M.reshape(info.batch_size, *(1,) * (q.dim() - 2), *M.shape[1:]).expand(*q.shape, q.shape[-1])
         if initial_basis is not None:
             initial_basis = _batch_first(initial_basis, in_dims[2], info.batch_size)
         return DifferentiableSolve.apply(M, q, initial_basis, solve, smoothed), (0,) * len(LCPSolution._fields)
 
 
-def _damping(z: Tensor, w: Tensor, solved: Tensor, smoothed: bool) -> Tensor:
+def _damping(z: Tensor, w: Tensor, solved: Tensor) -> Tensor:
     """The diagonal w / z that smoothing adds."""
-    return torch.where(solved, w, 0.0) / torch.where(solved, z, 1.0) if smoothed else torch.zeros_like(z)
+    return torch.where(solved, w, 0.0) / torch.where(solved, z, 1.0)
 
 
 def basis_solve(K: Tensor, basis: Tensor, rhs: Tensor) -> Tensor:
@@ -102,7 +113,7 @@ class _BasisSolve(torch.autograd.Function):
     """Its derivative is the same solve: dx = K_AA^-1 (drhs - dK x), so that second derivatives come for free."""
 
     @staticmethod
-    def forward(K: Tensor, basis: Tensor, rhs: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(K: Tensor, basis: Tensor, rhs: Tensor) -> Tensor:
         return _solve_block(K.double(), basis, rhs.double(), *RANK_TOLERANCES[K.dtype]).to(rhs.dtype)
 
     @staticmethod
@@ -111,26 +122,28 @@ class _BasisSolve(torch.autograd.Function):
         ctx.save_for_forward(inputs[0], inputs[1], output)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Any:
         K, basis, x = ctx.saved_tensors
         y = basis_solve(K.mT, basis, grad)
-        return -y.unsqueeze(-1) * x.unsqueeze(-2) if ctx.needs_input_grad[0] else None, None, y
+        grad_K = (-y.unsqueeze(-1) * x.unsqueeze(-2)).sum_to_size(K.shape) if ctx.needs_input_grad[0] else None
+        return grad_K, None, y
 
     @staticmethod
-    def jvp(ctx: Any, dK: Tensor | None, _: Any, drhs: Tensor | None) -> Tensor:  # type: ignore[override]
+    def jvp(ctx: Any, dK: Tensor | None, _: Any, drhs: Tensor | None) -> Tensor:
         K, basis, x = ctx.saved_tensors
         e = torch.zeros_like(x) if drhs is None else drhs
         return basis_solve(K, basis, e if dK is None else e - (dK @ x.unsqueeze(-1)).squeeze(-1))
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *tensors: Tensor) -> Any:
-        moved = [_batch_first(x, dim, info.batch_size) for x, dim in zip(tensors, in_dims, strict=True)]
-        return _BasisSolve.apply(*moved), 0
+        K, basis, rhs = (_batch_first(x, dim, info.batch_size) for x, dim in zip(tensors, in_dims, strict=True))
+        K = K.reshape(info.batch_size, *(1,) * (rhs.dim() + 1 - K.dim()), *K.shape[1:])
+        return _BasisSolve.apply(K, basis, rhs), 0
 
 
 def _solve_block(K: Tensor, basis: Tensor, rhs: Tensor, pivot_tolerance: float, rank_tolerance: float) -> Tensor:
     n = K.shape[-1]
-    if K.numel() == 0:
+    if rhs.numel() == 0:
         return torch.zeros_like(rhs)
     block = torch.where(basis.unsqueeze(-1) & basis.unsqueeze(-2), K, 0.0)
     rows, columns = two_sided_scales(block)

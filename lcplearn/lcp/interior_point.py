@@ -1,8 +1,8 @@
 """Batched primal-dual interior point method for LCPs in plain torch: any device, and the smoothed solution.
 
-On the equilibrated problem S = D M D, p = D q / s (powers of two, so that scaling rounds nothing) it follows the central
-path w = S z + p, z_i w_i = mu, with Mehrotra's predictor and corrector: one factorisation of S + W/Z an iteration,
-used twice, and one common step for z and w, which M couples. Elements that have finished leave the batch.
+On the equilibrated problem S = D M D, p = D q / s (powers of two, so that scaling rounds nothing) it follows the
+central path w = S z + p, z_i w_i = mu, with Mehrotra's predictor and corrector: one factorisation of S + W/Z an
+iteration, used twice, and one common step for z and w, which M couples. Finished elements leave the batch.
 Close to a solution the complementary basis z > w is tried: solving on it gives exact zeros and a residual of rounding.
 Derivation and choices: NOTES.md, section 2.
 """
@@ -20,6 +20,7 @@ DEFAULT_MAX_ITER = 100
 POLISH_BELOW = 1e-6  # try the basis once the merit is this small: earlier tries fail, later ones waste iterations
 EXACT = 16 * EPS
 CONVERGED = 50 * EPS
+ON_PATH = 1e-11  # relative error of z_i w_i = tau
 PATIENCE = 15  # iterations within which the complementarity gap has to halve
 REFINEMENTS = 3
 RIDGE = 1e-9  # for singular blocks; refinement takes its bias out again
@@ -103,7 +104,8 @@ def _follow_path(S: Tensor, p: Tensor, tau: Tensor, max_iter: int) -> tuple[_Bes
         halved = gap < 0.5 * a.gap
         a.gap, a.since = torch.where(halved, gap, a.gap), torch.where(halved, 0, a.since + 1)
         smoothed = (a.tau > 0).squeeze(-1)
-        finished = (smoothed & (merit <= CONVERGED)) | (a.since > PATIENCE)
+        on_path = smoothed & (gap <= ON_PATH * a.tau.squeeze(-1)) & (r.abs().amax(-1) <= CONVERGED)
+        finished = on_path | (a.since > PATIENCE)
         near = (merit < POLISH_BELOW) & ~smoothed
         if near.any():
             c = a.keep(near)
@@ -132,11 +134,13 @@ def _predict_and_correct(a: _Active, r: Tensor) -> tuple[Tensor, Tensor]:
         return dz, _multiply(a.S, dz) + r
 
     mu = (a.z * a.w).mean(-1, keepdim=True)
-    dz, dw = direction(-r - a.w)
+    dz, dw = direction(a.tau / a.z - r - a.w)
     step = _longest_step(a, dz, dw).clamp_max(1)
     mu_affine = ((a.z + step * dz) * (a.w + step * dw)).mean(-1, keepdim=True)
-    target = torch.maximum((mu_affine / mu).clamp(0, 1) ** 3 * mu, a.tau)
-    dz, dw = direction(-r - a.w + (target - dz * dw) / a.z)
+    excess = mu - a.tau
+    centering = torch.where(excess == 0, 0.0, (mu_affine - a.tau) / excess).clamp(0, 1) ** 3
+    target = a.tau + centering * excess
+    dz, dw = direction((target - dz * dw) / a.z - r - a.w)
     step = (torch.maximum(1 - mu, torch.full_like(mu, 0.99)) * _longest_step(a, dz, dw)).clamp_max(1)
     return a.z + step * dz, a.w + step * dw
 
@@ -150,8 +154,8 @@ def _longest_step(a: _Active, dz: Tensor, dw: Tensor) -> Tensor:
 def _improve(best: _Best, S: Tensor, p: Tensor, delta: float) -> None:
     """Correct the basis of elements that are not solved to rounding yet, in place.
 
-    With delta > 0 on the proximal problem (S + delta I, p - delta z): positive definite where S is semidefinite, so that
-    block pivoting succeeds, and a solution near z that is also one of the original problem in the limit.
+    With delta > 0 on the proximal problem (S + delta I, p - delta z): positive definite where S is semidefinite, so
+    that block pivoting succeeds, and its solution is one of the original problem in the limit.
     """
     rough = torch.nonzero(best.error > EXACT).squeeze(-1)
     if not len(rough):
@@ -166,7 +170,7 @@ def _improve(best: _Best, S: Tensor, p: Tensor, delta: float) -> None:
 def _correct_basis(S: Tensor, p: Tensor, best: _Best) -> None:
     """Improve `best` in place by block principal pivoting from its basis.
 
-    Flips every member with a wrong sign; if that stops lowering their number, only the last one (finite for P-matrices).
+    Flips every member with a wrong sign; if that stops lowering their number, only the last one (finite for P).
     Source: Judice and Pires, "A block principal pivoting algorithm for large-scale strictly monotone LCPs" (1994).
     """
     index = torch.arange(p.shape[0], device=p.device)

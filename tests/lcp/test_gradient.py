@@ -1,0 +1,186 @@
+"""Derivatives of `solve_lcp`: against finite differences, at kinks, in batches, where blocks are singular."""
+
+import pytest
+import torch
+from lcp.oracles import planted, random_family
+from torch.autograd import gradcheck, gradgradcheck
+
+from lcplearn import solve_lcp
+
+METHODS = ("pivoting", "interior_point")
+FRICTION = [[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]]  # notes 2.5 with mass = dt = 1
+
+
+def problem(family: str, batch: int = 3, n: int = 5, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    M = random_family(family, batch, n, generator)
+    return M.requires_grad_(), planted(M.detach(), generator)[0].requires_grad_()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("family", ["positive definite", "nonsymmetric definite", "nonsymmetric P"])
+def test_gradient_of_z_and_w_equals_finite_differences_off_kinks(method, family):
+    def z_and_w(M, q):
+        return solve_lcp(M, q, method=method)[:2]
+
+    assert gradcheck(z_and_w, problem(family))
+
+
+def test_gradient_of_the_diagonal_method_equals_finite_differences():
+    d = torch.tensor([0.5, 2.0, 3.0]).requires_grad_()
+    q = torch.tensor([-1.0, 1.0, -0.3]).requires_grad_()
+    assert gradcheck(lambda d, q: solve_lcp(torch.diag(d), q, method="diagonal")[:2], (d, q))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_second_derivatives_equal_finite_differences_of_first(method):
+    M, q = problem("nonsymmetric definite", batch=2, n=3)
+    assert gradgradcheck(lambda M, q: solve_lcp(M, q, method=method)[:2], (M, q))
+
+
+def test_smoothed_gradient_is_the_derivative_of_the_smoothed_value():
+    inputs = problem("nonsymmetric definite", batch=2, n=4)
+    assert gradcheck(lambda M, q: solve_lcp(M, q, smoothing=1e-3)[:2], inputs, rtol=1e-5)
+    assert gradgradcheck(lambda M, q: solve_lcp(M, q, smoothing=1e-2)[:2], inputs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_forward_mode_agrees_with_reverse_mode(method):
+    M, q = (x.detach() for x in problem("nonsymmetric definite"))
+    dM, dq = torch.randn_like(M), torch.randn_like(q)
+    for smoothing in (0.0, 1e-3) if method == "interior_point" else (0.0,):
+
+        def z_and_w(M, q, smoothing=smoothing):
+            return solve_lcp(M, q, method=method, smoothing=smoothing)[:2]
+
+        _, tangents = torch.func.jvp(z_and_w, (M, q), (dM, dq))
+        _, pullback = torch.func.vjp(z_and_w, M, q)
+        cotangents = tuple(torch.randn_like(q) for _ in range(2))
+        gM, gq = pullback(cotangents)
+        forward = sum((c * t).sum() for c, t in zip(cotangents, tangents, strict=True))
+        torch.testing.assert_close(forward, (gM * dM).sum() + (gq * dq).sum(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_vmap_grad_and_jacrev_see_each_element(method):
+    M, q = (x.detach() for x in problem("nonsymmetric definite"))
+
+    def loss(M, q):
+        return solve_lcp(M, q, method=method).z.square().sum()
+
+    per_element = torch.func.vmap(torch.func.grad(loss, argnums=(0, 1)))(M, q)
+    whole = torch.func.grad(loss, argnums=(0, 1))(M, q)
+    torch.testing.assert_close(per_element, whole)
+    shared = torch.func.vmap(lambda q: solve_lcp(M[0], q, method=method).z)(q)
+    torch.testing.assert_close(shared, solve_lcp(M[0], q, method=method).z)
+    jacobian = torch.func.jacrev(lambda q: solve_lcp(M[0], q, method=method).z)(q[0])
+    basis = solve_lcp(M[0], q[0], method=method).basis
+    expected = torch.zeros(5, 5)
+    A = basis.nonzero().squeeze(-1)
+    expected[A.unsqueeze(-1), A] = -torch.linalg.inv(M[0][A.unsqueeze(-1), A])
+    torch.testing.assert_close(jacobian, expected)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_shared_matrix_gets_the_sum_of_the_gradients_of_its_copies(method):
+    M, q = problem("nonsymmetric definite")
+    shared = M[0].detach().clone().requires_grad_()
+    copies = shared.detach().expand(3, 5, 5).clone().requires_grad_()
+    for matrix in (shared, copies):
+        solve_lcp(matrix, q.detach(), method=method).z.square().sum().backward()
+    torch.testing.assert_close(shared.grad, copies.grad.sum(0))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_elements_that_are_not_solved_give_zero_gradient_and_spoil_no_neighbour(method):
+    M, q = problem("positive definite", batch=4)
+    with torch.no_grad():
+        M[1, 0, 0], q[2, 3] = torch.nan, torch.inf
+        M[3], q[3] = -torch.eye(5), -1.0
+    solve_lcp(M, q, method=method).z.sum().backward()
+    alone_M, alone_q = M[0].detach().requires_grad_(), q[0].detach().requires_grad_()
+    solve_lcp(alone_M, alone_q, method=method).z.sum().backward()
+    assert not M.grad[1:].any()
+    assert not q.grad[1:].any()
+    torch.testing.assert_close(M.grad[0], alone_M.grad)
+    torch.testing.assert_close(q.grad[0], alone_q.grad)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nothing_is_computed_for_inputs_that_need_no_gradient(method):
+    M, q = problem("positive definite")
+    solve_lcp(M.detach(), q, method=method).z.sum().backward()
+    assert M.grad is None
+    assert q.grad is not None
+    assert not solve_lcp(M.detach(), q.detach(), method=method).z.requires_grad
+    with torch.no_grad():
+        assert not solve_lcp(M, q, method=method).z.requires_grad
+    with torch.inference_mode():
+        assert solve_lcp(M, q, method=method).solved.all()
+
+
+@pytest.mark.parametrize("method", ["diagonal", *METHODS])
+def test_gradient_at_a_kink_is_the_side_that_stays_at_zero(method):
+    """At z = w = 0 the one-sided derivatives of z(q) = max(0, -q) are -1 and 0; the member is not basic, so 0."""
+    q = torch.zeros(1).requires_grad_()
+    solution = solve_lcp(torch.ones(1, 1), q, method=method)
+    assert solution.degenerate.all()
+    solution.z.sum().backward()
+    assert q.grad == 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_at_a_coupled_kink_is_one_of_the_one_sided_derivatives(method):
+    M = torch.tensor([[2.0, 1.0], [1.0, 2.0]])
+    q = torch.tensor([-2.0, -1.0]).requires_grad_()  # z = (1, 0), w = (0, 0)
+    solution = solve_lcp(M, q, method=method)
+    torch.testing.assert_close(solution.degenerate, torch.tensor([False, True]))
+    solution.z.sum().backward()
+    h = 1e-6
+    slopes = []
+    for sign in (1, -1):
+        step = torch.tensor([0.0, sign * h])
+        slopes.append((solve_lcp(M, q.detach() + step).z.sum() - 1) / (sign * h))
+    assert min(abs(q.grad[1] - slope) for slope in slopes) < 1e-6
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("p", "expected"), [(0.3, 0.0), (-0.2, 0.0), (0.9, 1.0), (-0.7, 1.0)])
+def test_velocity_gradient_of_the_friction_problem_is_exact_although_its_forces_are_not_unique(method, p, expected):
+    """Errata 24: at stick the basis block is singular for an interior point; dv/dp = 0 there and 1 in slip."""
+    p = torch.tensor(p).requires_grad_()
+    z = solve_lcp(torch.tensor(FRICTION), torch.stack([p, -p, torch.tensor(0.4)]), method=method).z
+    velocity = p + z[0] - z[1]
+    velocity.backward()
+    assert p.grad == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("k", [2, 4, 7])
+def test_redundant_contacts_have_an_exact_velocity_gradient(method, k):
+    """M = ones(k, k), q = -b: sum z = b, whatever its split, so d(sum z)/db = 1."""
+    b = torch.tensor(1.0).requires_grad_()
+    z = solve_lcp(torch.ones(k, k), -b.expand(k), method=method).z
+    assert z.sum().item() == pytest.approx(1.0, abs=1e-14)
+    z.sum().backward()
+    assert b.grad == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_does_not_depend_on_the_units_of_rows_and_columns(method):
+    M, q = problem("nonsymmetric definite", batch=1, n=4)
+    scale = torch.tensor([1e-6, 1.0, 1e3, 1e6])
+    z = solve_lcp(M, q, method=method).z
+    expected = torch.autograd.grad(z.sum(), q)[0]
+    scaled = solve_lcp(scale.unsqueeze(-1) * M * scale, scale * q, method=method).z
+    torch.testing.assert_close(torch.autograd.grad((scale * scaled).sum(), q)[0], expected, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_float32_gradient_has_float32_type_and_accuracy(method):
+    M, q = problem("positive definite")
+    M32, q32 = M.detach().float().requires_grad_(), q.detach().float().requires_grad_()
+    solve_lcp(M, q, method=method).z.square().sum().backward()
+    solve_lcp(M32, q32, method=method).z.square().sum().backward()
+    assert M32.grad.dtype == torch.float32
+    torch.testing.assert_close(M32.grad, M.grad.float(), rtol=1e-3, atol=1e-4)

@@ -1,0 +1,268 @@
+"""Values and statuses of `solve_lcp` against enumeration, closed forms and planted solutions."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from lcp.oracles import FAMILIES, has_solution, natural_residual, planted, random_family
+
+from lcplearn import LCPError, LCPLayer, Status, solve_lcp
+
+METHODS = ("pivoting", "interior_point")
+entries = st.integers(-3, 3)
+
+
+def integer_problem(draw, n: int) -> tuple[np.ndarray, np.ndarray]:
+    return draw(arrays(np.float64, (n, n), elements=entries)), draw(arrays(np.float64, n, elements=entries))
+
+
+@st.composite
+def semidefinite_problems(draw):
+    """Integer F F' + K - K' of any rank, with any q: degenerate and infeasible problems among them."""
+    n = draw(st.integers(1, 6))
+    F = draw(arrays(np.float64, (n, draw(st.integers(1, n))), elements=st.integers(-2, 2)))
+    K = draw(arrays(np.float64, (n, n), elements=entries)) * draw(st.booleans())
+    return F @ F.T + K - K.T, draw(arrays(np.float64, n, elements=entries))
+
+
+@st.composite
+def arbitrary_problems(draw):
+    return integer_problem(draw, draw(st.integers(1, 5)))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@settings(deadline=None, max_examples=200)
+@given(problem=semidefinite_problems())
+def test_semidefinite_problem_is_solved_exactly_when_enumeration_finds_a_solution(method, problem):
+    M, q = problem
+    solution = solve_lcp(torch.tensor(M), torch.tensor(q), method=method)
+    assert bool(solution.solved) == has_solution(M, q)
+    if solution.solved:
+        assert natural_residual(M, q, solution.z.numpy()) <= 1e-9
+
+
+@pytest.mark.parametrize("method", METHODS)
+@settings(deadline=None, max_examples=200)
+@given(problem=arbitrary_problems())
+def test_status_is_true_for_any_matrix(method, problem):
+    M, q = problem
+    solution = solve_lcp(torch.tensor(M), torch.tensor(q), method=method)
+    if solution.solved:
+        assert natural_residual(M, q, solution.z.numpy()) <= 1e-8 * max(1, np.abs(q).max())
+    if solution.status == Status.INFEASIBLE:
+        assert not has_solution(M, q)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("n", [1, 3, 10, 30, 50])
+def test_planted_problem_has_a_residual_of_rounding(method, family, n):
+    generator = torch.Generator().manual_seed(n)
+    M = random_family(family, 32, n, generator)
+    q, _ = planted(M, generator)
+    solution = solve_lcp(M, q, method=method)
+    assert solution.solved.all()
+    assert solution.residual.max() <= 1e-10
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("family", ["positive definite", "nonsymmetric definite", "nonsymmetric P", "condition 1e10"])
+@pytest.mark.parametrize("n", [3, 20, 50])
+def test_row_and_column_scales_of_twelve_decades_do_not_matter(method, family, n):
+    generator = torch.Generator().manual_seed(n)
+    rows, columns = (10 ** (12 * torch.rand(16, n, generator=generator) - 6) for _ in range(2))
+    M = rows.unsqueeze(-1) * random_family(family, 16, n, generator) * columns.unsqueeze(-2)
+    q, _ = planted(M, generator)
+    solution = solve_lcp(M, q, method=method)
+    assert solution.residual.max() <= 1e-10
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_unscaled_semidefinite_problem_stays_solved_under_congruence(method):
+    generator = torch.Generator().manual_seed(0)
+    scale = 10 ** (12 * torch.rand(32, 20, generator=generator) - 6)
+    M = scale.unsqueeze(-1) * random_family("semidefinite", 32, 20, generator) * scale.unsqueeze(-2)
+    q, _ = planted(M, generator)
+    assert solve_lcp(M, q, method=method).residual.max() <= 1e-10
+
+
+@given(st.lists(st.tuples(st.floats(1e-6, 1e6), st.floats(-1e6, 1e6, allow_subnormal=False)), min_size=1, max_size=5))
+def test_diagonal_method_is_the_closed_form(pairs):
+    d, q = (torch.tensor(values) for values in zip(*pairs, strict=True))
+    solution = solve_lcp(torch.diag(d), q, method="diagonal")
+    assert solution.solved
+    assert torch.equal(solution.z, torch.where(q < 0, -q / d, 0.0))
+    assert torch.equal(solution.w, q.clamp_min(0))
+
+
+def test_diagonal_method_never_calls_a_coupled_problem_solved():
+    M = torch.tensor([[2.0, -1.0], [-1.0, 2.0]])
+    assert solve_lcp(M, -torch.ones(2), method="diagonal").status == Status.UNSOLVED
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_zeros_of_z_and_w_are_exact(method):
+    generator = torch.Generator().manual_seed(1)
+    M = random_family("nonsymmetric definite", 64, 12, generator)
+    q, _ = planted(M, generator)
+    solution = solve_lcp(M, q, method=method)
+    assert torch.equal(solution.z == 0, ~solution.basis)
+    assert torch.equal(solution.w == 0, solution.basis)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_batch_equals_its_elements_one_by_one_beside_unsolvable_and_non_finite_members(method):
+    generator = torch.Generator().manual_seed(2)
+    M = random_family("nonsymmetric definite", 12, 6, generator)
+    q, _ = planted(M, generator)
+    M[3, 1, 2], q[5, 0] = torch.nan, torch.inf
+    M[7], q[7] = -torch.eye(6), -1.0
+    batch = solve_lcp(M, q, method=method)
+    assert batch.status[3] == batch.status[5] == Status.NONFINITE_INPUT
+    assert batch.z[3].isnan().all()
+    assert batch.status[7] in (Status.INFEASIBLE, Status.UNSOLVED)
+    assert batch.solved.sum() == 9
+    for k in range(12):
+        alone = solve_lcp(M[k], q[k], method=method)
+        assert alone.status == batch.status[k]
+        assert torch.equal(alone.basis, batch.basis[k])
+        torch.testing.assert_close(alone.z, batch.z[k], rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("M", "q"),
+    [
+        ([[-1.0]], [-1.0]),  # infeasible
+        ([[0.0, 1.0], [-1.0, 0.0]], [-1.0, -1.0]),  # infeasible
+        ([[0.0, 1.0], [0.0, 1.0]], [-1.0, 0.0]),  # feasible, no complementary solution
+        ([[0.0]], [-1.0]),  # vanishing mass
+    ],
+)
+def test_unsolvable_problem_is_never_called_solved(method, M, q):
+    solution = solve_lcp(torch.tensor(M), torch.tensor(q), method=method)
+    assert not solution.solved
+    assert solution.z.isfinite().all()
+
+
+def test_large_equal_z_of_a_singular_infeasible_problem_is_not_accepted():
+    """Criterion (b) of the residual: z = t (1, 1) has a tiny natural residual relative to z, and solves nothing."""
+    M = torch.tensor([[1.0, -1.0], [-1.0, 1.0]])
+    q = -torch.ones(2)
+    for method in METHODS:
+        assert not solve_lcp(M, q, method=method).solved
+
+
+def test_decoupled_tiny_row_counts():
+    """Criterion (a) alone would not see the second row; dividing by 1 + |q| would not either."""
+    M, q = torch.diag(torch.tensor([1.0, 1e-12])), torch.tensor([1e6, -1e-6])
+    for method in METHODS:
+        z = solve_lcp(M, q, method=method).z
+        assert z[0] == 0
+        assert z[1] == pytest.approx(1e6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_scaling_the_data_scales_the_solution(method):
+    generator = torch.Generator().manual_seed(3)
+    M = random_family("positive definite", 8, 5, generator)
+    q, _ = planted(M, generator)
+    z = solve_lcp(M, q, method=method).z
+    for a, b in ((1e-12, 1.0), (1e12, 1e-8), (1.0, 1e10)):
+        scaled = solve_lcp(a * M, b * q, method=method)
+        assert scaled.solved.all()
+        torch.testing.assert_close(scaled.z * a / b, z, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["auto", "diagonal", *METHODS])
+def test_empty_batches_and_empty_problems_work(method):
+    for M_shape, q_shape in (((0, 3, 3), (0, 3)), ((4, 0, 0), (4, 0)), ((2, 0, 5, 5), (0, 5))):
+        M, q = torch.zeros(M_shape).requires_grad_(), torch.zeros(q_shape).requires_grad_()
+        solution = solve_lcp(M, q, method=method)
+        assert solution.z.shape == torch.broadcast_shapes(M_shape[:-1], q_shape)
+        assert solution.solved.all()
+        solution.summary()
+        assert not solution.degenerate.any()
+        solution.z.sum().backward()
+        assert M.grad.shape == M.shape
+
+
+@pytest.mark.parametrize("method", ["auto", *METHODS])
+def test_float32_in_float32_out_with_float64_inside(method):
+    generator = torch.Generator().manual_seed(4)
+    M = (random_family("condition 1e10", 16, 10, generator) + 1e-5 * torch.eye(10)).float()
+    q = planted(M.double(), generator)[0].float()
+    solution = solve_lcp(M, q, method=method)
+    assert solution.z.dtype == solution.w.dtype == torch.float32
+    assert solution.residual.dtype == torch.float64
+    assert solution.solved.all()
+    assert torch.equal(solution.z, solve_lcp(M.double(), q.double(), method=method).z.float())
+
+
+def test_batch_dimensions_broadcast():
+    M = torch.eye(2).expand(3, 1, 2, 2)
+    q = -torch.rand(4, 2)
+    solution = solve_lcp(M, q)
+    assert solution.z.shape == (3, 4, 2)
+    torch.testing.assert_close(solution.z, -q.expand(3, 4, 2))
+
+
+def test_smoothed_solution_lies_on_the_central_path_and_tends_to_the_solution():
+    generator = torch.Generator().manual_seed(5)
+    M = random_family("nonsymmetric definite", 16, 6, generator)
+    q, z = planted(M, generator)
+    for tau in (1e-2, 1e-4, 1e-8):
+        smoothed = solve_lcp(M, q, smoothing=tau)
+        assert smoothed.solved.all()
+        torch.testing.assert_close(smoothed.z * smoothed.w, torch.full_like(z, tau), rtol=1e-8, atol=0)
+        torch.testing.assert_close(smoothed.w, (M @ smoothed.z.unsqueeze(-1)).squeeze(-1) + q, rtol=1e-9, atol=1e-12)
+        assert (smoothed.z - z).abs().max() < 300 * tau
+
+
+def test_limit_on_iterations_is_reported_as_such():
+    generator = torch.Generator().manual_seed(6)
+    M = random_family("condition 1e10", 4, 50, generator)
+    q, _ = planted(M, generator)
+    solution = solve_lcp(M, q, method="interior_point", max_iter=1)
+    assert set(solution.status.tolist()) <= {Status.MAX_ITERATIONS, Status.SOLVED}
+
+
+def test_throw_names_the_elements_and_the_reason():
+    M, q = torch.eye(1).expand(3, 1, 1).clone(), torch.tensor([[-1.0], [torch.nan], [-1.0]])
+    M[2] = -1
+    with pytest.raises(LCPError, match=r"2 of 3 .*\(1,\), \(2,\).*NONFINITE_INPUT"):
+        LCPLayer(throw=True)(M, q)
+
+
+def test_summary_counts_statuses_and_kinks():
+    M = torch.eye(2).expand(4, 2, 2).clone()
+    q = torch.tensor([[-1.0, 1.0], [0.0, -1.0], [1.0, 1.0], [torch.nan, 0.0]])
+    summary = solve_lcp(M, q).summary()
+    assert summary["solved_share"] == 0.75
+    assert summary["nonfinite_input_share"] == 0.25
+    assert summary["degenerate_share"] == 0.25
+    assert summary["worst_residual"] <= 1e-15
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda M, q: solve_lcp(M.numpy(), q), "M must be a torch.Tensor; got ndarray"),
+        (lambda M, q: solve_lcp(M.int(), q), "M must be float32 or float64; got torch.int32"),
+        (lambda M, q: solve_lcp(M, q.float()), "M and q must share dtype and device"),
+        (lambda M, q: solve_lcp(M[:, :2], q), r"M must have shape \[\*batch, n, n\]; got \[3, 2\]"),
+        (lambda M, q: solve_lcp(M, q[:2]), r"q must have shape \[\*batch, 3\]"),
+        (lambda M, q: solve_lcp(M.expand(2, 3, 3), q.expand(4, 3)), "must broadcast"),
+        (lambda M, q: solve_lcp(M, q, method="lemke"), "method must be one of auto, diagonal"),
+        (lambda M, q: solve_lcp(M, q, tol=-1.0), "tol must be positive"),
+        (lambda M, q: solve_lcp(M, q, max_iter=0), "max_iter must be a positive integer"),
+        (lambda M, q: solve_lcp(M, q, smoothing=-1.0), "smoothing must be finite"),
+        (lambda M, q: solve_lcp(M, q, smoothing=0.1, method="diagonal"), "smoothing needs method"),
+        (lambda M, q: LCPLayer(method="newton"), "method must be one of"),
+    ],
+)
+def test_wrong_argument_raises_a_value_error_that_names_it(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(torch.eye(3), torch.ones(3))
