@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +43,12 @@ def read_npz(path: Path | str, keys: tuple[str, ...]) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: expected an NPZ file (a zip of arrays), got something else; pickles are not read")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             missing = [key for key in keys if key not in file]
             if missing:
                 raise ValueError(f"expected the arrays {', '.join(keys)}, {', '.join(missing)} missing")
-            arrays = {key: file[key] for key in keys}
-    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+            arrays = {key: np.asarray(file[key]) for key in keys}  # a member that is no array comes as bytes
+    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         reason = "arrays of Python objects (pickles) are not read" if "allow_pickle" in str(error) else error
         raise ValueError(f"{path}: {reason}") from None
     for key, array in arrays.items():
