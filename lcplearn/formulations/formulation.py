@@ -96,7 +96,7 @@ class Formulation(nn.Module):
         return {}
 
     def solve(
-        self, M: Float[Tensor, "*batch n n"], q: Float[Tensor, "*batch n"], method: Method = "auto"
+        self, M: Float[Tensor, "*#batch n n"], q: Float[Tensor, "*#batch n"], method: Method = "auto"
     ) -> LCPSolution:
         """Solve the model's LCP and keep the detached solution as `last_solution` for reports."""
         solution = solve_lcp(M, q, method=method)
