@@ -1,21 +1,29 @@
 """Learn contact and friction with a batched, differentiable LCP layer."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from lcplearn.lcp.layer import LCPLayer
-from lcplearn.lcp.solution import LCPError, LCPSolution, Status
-from lcplearn.lcp.solve import solve_lcp
-
 if TYPE_CHECKING:
+    from lcplearn.lcp.layer import LCPLayer
+    from lcplearn.lcp.solution import LCPError, LCPSolution, Status
+    from lcplearn.lcp.solve import solve_lcp
     from lcplearn.training.checkpoint import load
 
 __all__ = ["LCPError", "LCPLayer", "LCPSolution", "Status", "load", "solve_lcp"]
 
+_HOMES = {
+    "LCPError": "lcplearn.lcp.solution",
+    "LCPLayer": "lcplearn.lcp.layer",
+    "LCPSolution": "lcplearn.lcp.solution",
+    "Status": "lcplearn.lcp.solution",
+    "load": "lcplearn.training.checkpoint",
+    "solve_lcp": "lcplearn.lcp.solve",
+}
+
 
 def __getattr__(name: str) -> Any:
-    # Loaded on first use: whoever wants only the LCP layer does not pay for the training code.
-    if name == "load":
-        from lcplearn.training.checkpoint import load
-
-        return load
-    raise AttributeError(f"module 'lcplearn' has no attribute {name!r}")
+    # Imported on first use, so that a command finds a user's mistake before it has paid seconds for torch.
+    if name not in _HOMES:
+        raise AttributeError(f"module 'lcplearn' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value

@@ -80,9 +80,11 @@ class _Best(NamedTuple):
     basis: Bool[Tensor, "b n"]
     error: Float[Tensor, " b"]
 
-    def offer(self, index: Tensor, S: Tensor, p: Tensor, z: Tensor, w: Tensor, basis: Tensor) -> Tensor:
-        """Take points that are better than those held; returns their residual."""
-        z, w = z.clamp_min(0), w.clamp_min(0)
+    def offer(self, index: Tensor, S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> Tensor:
+        """Take points that are better than those held, their zeros made exact; returns their residual."""
+        basis = basis & (z > 0)
+        z = torch.where(basis, z, 0.0)
+        w = torch.where(basis, 0.0, _multiply(S, z) + p).clamp_min(0)
         error = judge(S, p, z, tol=EXACT).residual
         better = error < self.error[index]
         for held, offered in zip(self, (z, w, basis, error), strict=True):
@@ -96,33 +98,44 @@ def _follow_path(S: Tensor, p: Tensor, tau: Tensor, max_iter: int) -> tuple[_Bes
     index = torch.arange(p.shape[0], device=p.device)
     best = _Best(ones.clone(), ones.clone(), ones > 0, infinite.clone())
     iterations, exhausted = torch.zeros_like(index), index < 0
+    smoothed = bool((tau > 0).any())
     a = _Active(index, S, p, tau, z=ones, w=ones, gap=infinite, since=iterations.clone())
     for iteration in range(max_iter + 1):
         r = _multiply(a.S, a.z) + a.p - a.w
-        gap = (a.z * a.w - a.tau).abs().amax(-1)
-        merit = torch.maximum(gap, r.abs().amax(-1))
+        gap, infeasibility = (a.z * a.w - a.tau).abs().amax(-1), r.abs().amax(-1)
         halved = gap < 0.5 * a.gap
         a.gap, a.since = torch.where(halved, gap, a.gap), torch.where(halved, 0, a.since + 1)
-        smoothed = (a.tau > 0).squeeze(-1)
-        on_path = smoothed & (gap <= ON_PATH * a.tau.squeeze(-1)) & (r.abs().amax(-1) <= CONVERGED)
-        finished = on_path | (a.since > PATIENCE)
-        near = (merit < POLISH_BELOW) & ~smoothed
-        if near.any():
-            c = a.keep(near)
-            finished[near] |= best.offer(c.index, c.S, c.p, *solve_on_basis(c.S, c.p, c.z, c.z > c.w)) <= EXACT
+        finished = a.since > PATIENCE
+        if smoothed:
+            finished |= (gap <= ON_PATH * a.tau.squeeze(-1)) & (infeasibility <= CONVERGED)
+        else:
+            finished |= _try_basis(best, a, torch.maximum(gap, infeasibility) < POLISH_BELOW)
         z, w = _predict_and_correct(a, r)
         finished |= ~(z.isfinite() & w.isfinite()).all(-1)
         out_of_time = ~finished & (iteration == max_iter)
         stop = finished | out_of_time
+        iterations[a.index], exhausted[a.index] = iteration, out_of_time
         if stop.any():
             c = a.keep(stop)
-            best.offer(c.index, c.S, c.p, c.z, c.w, (c.z > c.w) | (c.tau > 0))
-            iterations[c.index], exhausted[a.index] = iteration, out_of_time
+            if smoothed:
+                best.z[c.index], best.w[c.index] = c.z, c.w
+            else:
+                best.offer(c.index, c.S, c.p, c.z, c.z > c.w)
             a, z, w = a.keep(~stop), z[~stop], w[~stop]
         if not len(a.index):
             break
         a.z, a.w = z, w
     return best, iterations, exhausted
+
+
+def _try_basis(best: _Best, a: _Active, near: Bool[Tensor, " b"]) -> Bool[Tensor, " b"]:
+    """Solve on the basis z > w of elements near their solution; True for those that this solves to rounding."""
+    exact = torch.zeros_like(near)
+    if near.any():
+        c = a.keep(near)
+        basis = c.z > c.w
+        exact[near] = best.offer(c.index, c.S, c.p, solve_on_basis(c.S, c.p, c.z, basis), basis) <= EXACT
+    return exact
 
 
 def _predict_and_correct(a: _Active, r: Tensor) -> tuple[Tensor, Tensor]:
@@ -163,8 +176,8 @@ def _improve(best: _Best, S: Tensor, p: Tensor, delta: float) -> None:
     S, p, z = S[rough], p[rough], best.z[rough]
     shifted = _Best(z.clone(), z.clone(), best.basis[rough], torch.full_like(best.error[rough], torch.inf))
     _correct_basis(S + delta * torch.eye(p.shape[-1], dtype=p.dtype, device=p.device), p - delta * z, shifted)
-    best.offer(rough, S, p, shifted.z, torch.where(shifted.basis, 0.0, _multiply(S, shifted.z) + p), shifted.basis)
-    best.offer(rough, S, p, *solve_on_basis(S, p, shifted.z, shifted.basis))
+    for z in (shifted.z, solve_on_basis(S, p, shifted.z, shifted.basis)):
+        best.offer(rough, S, p, z, shifted.basis)
 
 
 def _correct_basis(S: Tensor, p: Tensor, best: _Best) -> None:
@@ -179,8 +192,9 @@ def _correct_basis(S: Tensor, p: Tensor, best: _Best) -> None:
     patience = torch.full_like(index, FLIP_PATIENCE)
     member = torch.arange(p.shape[-1], device=p.device)
     for _ in range(3 * p.shape[-1] + 20):
-        z, w, _ = solve_on_basis(S, p, z, basis)
-        error = best.offer(index, S, p, z, w, basis)
+        z = solve_on_basis(S, p, z, basis)
+        w = _multiply(S, z) + p
+        error = best.offer(index, S, p, z, basis)
         omega = p.abs() + _multiply(S.abs(), z.abs())
         wrong = torch.where(basis, z < -8 * EPS * z.abs().amax(-1, keepdim=True), w < -8 * EPS * omega)
         count = wrong.sum(-1)
@@ -194,8 +208,8 @@ def _correct_basis(S: Tensor, p: Tensor, best: _Best) -> None:
         S, p, z, basis, index, patience, fewest = (x[go_on] for x in (S, p, z, basis, index, patience, fewest))
 
 
-def solve_on_basis(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """z, w and A with S_AA z_A = -p_A on the basis A, starting from z: exact zeros of z off A, of w on A, signs free.
+def solve_on_basis(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> Tensor:
+    """z with S_AA z_A = -p_A on the basis A and z = 0 off it, of any sign, starting from a z near it.
 
     Corrections to the current z rather than a fresh solve: where S_AA is singular (every stick of a friction LCP) they
     leave the part of z in its null space alone and still converge to a consistent solution.
@@ -214,7 +228,7 @@ def solve_on_basis(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> tuple[Tens
     for _ in range(REFINEMENTS):
         r = torch.where(basis, rows * (_multiply(S, z) + p), 0.0)
         z = z - columns * torch.linalg.lu_solve(factors, pivots, r.unsqueeze(-1)).squeeze(-1)
-    return z, torch.where(basis, 0.0, _multiply(S, z) + p), basis
+    return z
 
 
 def _multiply(S: Tensor, x: Tensor) -> Tensor:

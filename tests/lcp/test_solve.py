@@ -266,3 +266,12 @@ def test_summary_counts_statuses_and_kinks():
 def test_wrong_argument_raises_a_value_error_that_names_it(call, message):
     with pytest.raises(ValueError, match=message):
         call(torch.eye(3), torch.ones(3))
+
+
+@pytest.mark.parametrize("method", ["diagonal", *METHODS])
+def test_w_is_not_zeroed_with_a_member_that_leaves_the_basis(method):
+    """z = (0.59, 0), w = (0, 3.5e-5): the second member is close to basic, and is not."""
+    M, q = torch.eye(2) / 1.5, torch.tensor([-0.39243484525647476, 3.48452564746804e-05])
+    solution = solve_lcp(M, q, method=method)
+    torch.testing.assert_close(solution.w, torch.tensor([0.0, q[1]]), rtol=1e-14, atol=0)
+    assert solution.basis.tolist() == [True, False]
