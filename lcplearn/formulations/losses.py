@@ -120,8 +120,10 @@ def _known_friction_parts(model: Formulation, windows: Windows, term: str) -> Fl
 
 def _complementarity(model: Formulation, windows: Windows) -> Tensor:
     parts = _known_friction_parts(model, windows, "complementarity")
-    assert windows.friction is not None  # noqa: S101 - for the type checker: velocity_parts has refused None
-    return _mean((windows.friction[:, 0] * parts).square().sum(-1), windows.valid[:, 0])
+    friction = _first_friction(windows)
+    if friction is None:
+        raise ValueError("Loss term 'complementarity' needs windows with friction, and these have none.")
+    return _mean((friction * parts).square().sum(-1), windows.valid[:, 0])
 
 
 def _nonnegativity(model: Formulation, windows: Windows) -> Tensor:

@@ -36,6 +36,8 @@ class ReLU(Formulation):
         self.net = network(2, 2, width=width, depth=depth, activation="tanh")
         output = cast(nn.Linear, self.net[-1])
         with torch.no_grad():
+            if depth == 0:
+                output.weight[0].abs_()  # a block goes on, and goes where it is pushed: from w < 0 the outputs can die
             output.weight[1] = -output.weight[0]
             output.bias.fill_(INITIAL_BIAS)
 
