@@ -13,7 +13,7 @@ from lcplearn.formulations.formulation import Formulation
 from lcplearn.formulations.relu import ReLU
 from lcplearn.formulations.structured import FrictionLCP
 
-VIOLATION_WIDTH = 1.0  # [m/s] speed from which the violation loss takes friction to be fully used
+VIOLATION_WIDTH = 2.0  # [m/s] speed from which friction must be fully used; least biased for noise of 0.01 m/s
 
 
 class Windows(NamedTuple):
@@ -144,7 +144,7 @@ def violation(
 ) -> Float[Tensor, "*batch"]:
     """Find the friction that explains a step best, and return how badly it does.
 
-    min over y of  (r - y)^2 + k (y + sign(v') l)^2 + max(0, |y| - l)^2,   k = min(|v'| / 1 m/s, 1)
+    min over y of  (r - y)^2 + k (y + sign(v') l)^2 + max(0, |y| - l)^2,   k = min(|v'| / width, 1)
 
     The friction y (a change of velocity) should explain the step's remainder r = v' - b, oppose a fast motion with
     all that is allowed, and never exceed the limit l. No LCP is solved or differentiated.

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lcplearn.formulations import FORMULATIONS, LOSS_TERMS, Direct, Formulation, Physical, Windows, loss_terms
-from lcplearn.formulations.losses import violation
+from lcplearn.formulations.losses import VIOLATION_WIDTH, violation
 
 DT, GRAVITY = 0.1, 10.0
 MODELS_OF = {
@@ -144,7 +144,7 @@ def test_gradients_of_losses_equal_central_differences(name: str, term: str) -> 
 
 def objective(after: Tensor, unexplained: Tensor, limit: Tensor, y: Tensor) -> Tensor:
     """What `violation` minimises over y, written out."""
-    gate = after.abs().clamp(max=1.0)
+    gate = (after.abs() / VIOLATION_WIDTH).clamp(max=1.0)
     excess = (y.abs() - limit).clamp(min=0)
     return (unexplained - y) ** 2 + gate * (y + torch.sign(after) * limit) ** 2 + excess**2
 
@@ -164,7 +164,7 @@ def test_the_violation_loss_is_the_minimum_over_a_grid_of_frictions(
 
 def test_the_violation_loss_vanishes_on_fast_true_steps_and_on_sticks() -> None:
     """A slip faster than the gate with y = -sign(v') l, and a stick explained by less than the limit."""
-    assert violation(tensor(2.0), tensor(-0.3), tensor(0.3)).item() == pytest.approx(0.0, abs=1e-30)
+    assert violation(tensor(2 * VIOLATION_WIDTH), tensor(-0.3), tensor(0.3)).item() == pytest.approx(0.0, abs=1e-30)
     assert violation(tensor(0.0), tensor(0.2), tensor(0.3)).item() == pytest.approx(0.0, abs=1e-30)
     assert violation(tensor(0.0), tensor(0.5), tensor(0.3)).item() == pytest.approx(0.02)  # y = 0.4: 0.01 + 0.01
 
