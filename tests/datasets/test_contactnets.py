@@ -1,24 +1,16 @@
 """The converter of the published tosses, against the shared files made from the same tosses."""
 
-import os
 import pickle
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from real_data import real_data
 
 from lcplearn.datasets import read_cube_slides
 from lcplearn.datasets.contactnets import convert, final_slide, main, read_toss
-
-
-def shared(name: str) -> Path:
-    path = Path(os.environ.get("LCPLEARN_DATA") or "data") / name
-    if not path.exists():
-        pytest.skip(f"needs real data: {path} is missing (set LCPLEARN_DATA to its folder)")
-    return path
 
 
 def record(file: dict[str, np.ndarray], rows: str, number: int) -> np.ndarray:
@@ -28,10 +20,10 @@ def record(file: dict[str, np.ndarray], rows: str, number: int) -> np.ndarray:
 
 def test_the_five_raw_files_give_the_shared_rows():
     """Issue, section 3: to 1e-12."""
-    tosses, slides = convert(shared("contactnets_raw"))
-    with np.load(shared("cube_tosses.npz")) as file:
+    tosses, slides = convert(real_data("contactnets_raw"))
+    with np.load(real_data("cube_tosses.npz")) as file:
         expected_tosses = dict(file)
-    with np.load(shared("cube_slides.npz")) as file:
+    with np.load(real_data("cube_slides.npz")) as file:
         expected_slides = dict(file)
     assert tosses["source_id"].tolist() == slides["source_id"].tolist() == [0, 1, 10, 100, 101]
     for number in tosses["source_id"]:
@@ -48,9 +40,9 @@ def test_the_five_raw_files_give_the_shared_rows():
 
 
 def test_all_456_shared_tosses_give_the_443_shared_slides():
-    with np.load(shared("cube_tosses.npz")) as file:
+    with np.load(real_data("cube_tosses.npz")) as file:
         tosses = dict(file)
-    with np.load(shared("cube_slides.npz")) as file:
+    with np.load(real_data("cube_slides.npz")) as file:
         slides = dict(file)
     found = {}
     for number in tosses["source_id"].tolist():

@@ -1,7 +1,6 @@
 """Real slides: the split, and one clear sentence for each kind of bad file."""
 
 import contextlib
-import os
 import pickle
 import zipfile
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from real_data import real_data
 
 from lcplearn.datasets import BlockData, find, read_cube_slides
 from lcplearn.datasets.cube_slides import COLUMNS
@@ -16,10 +16,7 @@ from lcplearn.datasets.cube_slides import COLUMNS
 
 @pytest.fixture
 def slides() -> Path:
-    path = Path(os.environ.get("LCPLEARN_DATA") or "data") / "cube_slides.npz"
-    if not path.is_file():
-        pytest.skip(f"needs real data: {path} is missing (set LCPLEARN_DATA to its folder)")
-    return path
+    return real_data("cube_slides.npz")
 
 
 def arrays(slides: int = 6, rows: int = 5) -> dict[str, np.ndarray]:
