@@ -65,8 +65,8 @@ def semidefinite(rng: np.random.Generator, B: int, n: int) -> Problems:
     return _plant(rng, G @ G.transpose(0, 2, 1) / n)
 
 
-def nonsymmetric_P(rng: np.random.Generator, B: int, n: int) -> Problems:
-    """F7: nonsymmetric P-matrices that are not positive definite: row and column scaled M with positive definite part."""
+def nonsymmetric(rng: np.random.Generator, B: int, n: int) -> Problems:
+    """F7: nonsymmetric P-matrices: D1 M D2 with M + M' positive definite; not definite themselves."""
     G, H = rng.standard_normal((2, B, n, n))
     M = G @ G.transpose(0, 2, 1) / n + 0.1 * np.eye(n) + (H - H.transpose(0, 2, 1)) / np.sqrt(n)
     return _plant(rng, M * rng.uniform(0.3, 3.0, (B, n, 1)) * rng.uniform(0.3, 3.0, (B, 1, n)))
@@ -226,8 +226,8 @@ RANDOM_FAMILIES: dict[str, Callable[[np.random.Generator, int], Problems]] = {
     "F5 positive definite n=100": lambda rng, B: positive_definite(rng, B, 100),
     "F6 semidefinite n=20": lambda rng, B: semidefinite(rng, B, 20),
     "F6 semidefinite n=50": lambda rng, B: semidefinite(rng, B, 50),
-    "F7 nonsymmetric P n=10": lambda rng, B: nonsymmetric_P(rng, B, 10),
-    "F7 nonsymmetric P n=50": lambda rng, B: nonsymmetric_P(rng, B, 50),
+    "F7 nonsymmetric P n=10": lambda rng, B: nonsymmetric(rng, B, 10),
+    "F7 nonsymmetric P n=50": lambda rng, B: nonsymmetric(rng, B, 50),
     "F8 condition 1e8 n=20": lambda rng, B: ill_conditioned(rng, B, 20, 1e8),
     "F8 condition 1e12 n=20": lambda rng, B: ill_conditioned(rng, B, 20, 1e12),
     "badly scaled n=20": lambda rng, B: badly_scaled(rng, B, 20),

@@ -43,12 +43,17 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-def _jit(function: Callable[..., Any]) -> Any:
+def _jit(function: Callable[..., Any], **options: Any) -> Any:
     """numba.njit with a cache, or without one where no cache folder can be written."""
     try:
-        return numba.njit(cache=True, **_OPTIONS)(function)
+        return numba.njit(cache=True, **_OPTIONS, **options)(function)
     except RuntimeError:  # "cannot cache function: no locator available"
-        return numba.njit(**_OPTIONS)(function)
+        return numba.njit(**_OPTIONS, **options)(function)
+
+
+def _jit_inline(function: Callable[..., Any]) -> Any:
+    """As `_jit`, for what is called once an element: to pass 30 arrays takes as long as a problem of two unknowns."""
+    return _jit(function, forceinline=True)
 
 
 class PivotingResult(NamedTuple):
@@ -104,7 +109,7 @@ def solve_batch(
     _announce_compilation()
     M, q = _plain(M), _plain(q)
     budget = -1 if max_iter is None else max_iter
-    floats, integers = np.empty(3 * n * n + 14 * n + 2), np.empty(8 * n + 2, dtype=np.int64)  # scratch
+    floats, integers = np.empty(3 * n * n + 17 * n + 5), np.empty(8 * n + 2, dtype=np.int64)  # scratch
     _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, floats, integers, *result)
     return result
 
@@ -170,14 +175,16 @@ def _announce_compilation() -> None:
 # solving a small problem. So the kernels see bare views of arrays that `solve_batch` keeps alive.
 
 
-@intrinsic
-def _pointer(_, address, example):
+def _pointer_code(_, address, example):
     """The address as a pointer to numbers of the example's type."""
 
     def codegen(context, builder, signature, args):
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
 
     return types.CPointer(example)(types.uintp, example), codegen
+
+
+_pointer: Any = intrinsic(_pointer_code)
 
 
 @_jit
@@ -251,7 +258,7 @@ def _solve(A, k, rank, rows, cols, x, scratch):
         x[cols[c]] = scratch[c]
 
 
-@_jit
+@_jit_inline
 def _gather(S, basis, A, index):
     """Copy S_AA to A and A's members to index; its size."""
     n = S.shape[0]
@@ -271,10 +278,10 @@ def _gather(S, basis, A, index):
 
 @_jit
 def _nonnegative(x):
+    negative = 0
     for i in range(x.size):
-        if x[i] < 0.0:
-            return False
-    return True
+        negative += x[i] < 0.0
+    return negative == 0
 
 
 @_jit
@@ -306,13 +313,14 @@ def _equilibrate(M, size, largest, d):
             for j in range(n):
                 scaled = size[i, j] * di
                 largest[j] = scaled if scaled > largest[j] else largest[j]
-        change = 0.0
+        moved = 0
         for j in range(n):
             scaled = largest[j] * d[j]
-            if scaled > 0.0:
-                d[j] /= sqrt(max(scaled, 2.2250738585072014e-308))
-                change = max(change, abs(scaled - 1.0))
-        if change < 1e-6:  # further sweeps would move the residual by as little
+            largest[j] = scaled if scaled > 0.0 else 1.0
+            moved += abs(largest[j] - 1.0) > 1e-6
+        for j in range(n):
+            d[j] /= sqrt(max(largest[j], 2.2250738585072014e-308))
+        if moved == 0:  # further sweeps would change the residual by a millionth
             break
 
 
@@ -368,7 +376,7 @@ def _evaluate(S, p, z, w, omega):
         omega[i] = size
 
 
-@_jit
+@_jit_inline
 def _judge(q, p, d, r, c, s, z, w, omega, tol):
     """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
     n = q.size
@@ -411,7 +419,7 @@ def _drop_noise(z, w, omega, S, tol):
 # --- refinement and block pivoting ----------------------------------------------------------------------------------
 
 
-@_jit
+@_jit_inline
 def _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch):
     """Newton steps on w_A = 0 with the factors of S_AA, from z with its w and omega; then z >= 0."""
     n = p.size
@@ -443,6 +451,11 @@ def _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch):
     for i in range(n):
         z[i] = z[i] if basis[i] else 0.0
     _evaluate(S, p, z, w, omega)
+    wrong = 0
+    for i in range(n):
+        wrong += basis[i] != 0 and abs(w[i]) > 32.0 * EPS * omega[i]
+    if wrong == 0:
+        return
     k = _gather(S, basis, A, index)
     rank = _factor(A, k, rows, cols, 4.0 * n * EPS, False)
     if rank < k:
@@ -451,7 +464,7 @@ def _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch):
     _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch)
 
 
-@_jit
+@_jit_inline
 def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, cap):
     """Flip all infeasible members of the basis at a time, from the given one; how it ended and the rounds."""
     n = p.size
@@ -502,7 +515,7 @@ def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, 
 @_jit
 def _start_tableau(S, p, cover, T, basic, column, place):
     """Dictionary at w = p + S z + cover z_0, with z_0 already exchanged for the lexicographically smallest row."""
-    n = p.size
+    n, width = T.shape
     row, smallest = 0, np.inf
     for i in range(n):
         basic[i], column[i] = i, n + i
@@ -514,6 +527,8 @@ def _start_tableau(S, p, cover, T, basic, column, place):
         for j in range(n):
             T[i, j] = S[i, j] - ratio * S[row, j]
         T[i, n], T[i, n + 1] = ratio, p[i] - ratio * p[row]
+        for j in range(n + 2, width):
+            T[i, j] = 0.0
     for j in range(n):
         T[row, j] = -S[row, j] / cover[row]
     T[row, n], T[row, n + 1] = 1.0 / cover[row], -p[row] / cover[row]
@@ -525,7 +540,7 @@ def _start_tableau(S, p, cover, T, basic, column, place):
 @_jit
 def _exchange(T, basic, column, place, row, c, buffer):
     """Pivot: the nonbasic variable of column c becomes basic in this row."""
-    n, width = T.shape
+    n, width = T.shape  # columns beyond n + 2 are zeros
     inverse = 1.0 / T[row, c]
     T[row, c] = -1.0
     for j in range(width):
@@ -720,7 +735,7 @@ def _prepare_lemke(stage, single_precision, cover):
     return 1e-9 if single_precision else 1e-12
 
 
-@_jit
+@_jit_inline
 def _solve_one(
     M, q, tol, single_precision, budget, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
     rows, cols, index, basic, basis, column, place, z_out, w_out, basis_out, u_out
@@ -812,14 +827,15 @@ def _solve_range(
 ):
     """Run the cascade for each element; the last arguments are the fields of PivotingResult."""
     B, n = z_out.shape
+    width = (n + 5) // 4 * 4  # whole vectors of 4 doubles
     Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
     qs = numba.carray(_pointer(q.ctypes.data, 0.0), q.shape)
-    S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n, n + 2)
-    f = 3 * n * n + 2 * n
+    S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n, width)
+    f = n * (2 * n + width)
     d, p, cover = _vector(floats, f, n), _vector(floats, f + n, n), _vector(floats, f + 2 * n, n)
     z, w, omega = _vector(floats, f + 3 * n, n), _vector(floats, f + 4 * n, n), _vector(floats, f + 5 * n, n)
     x, y, v = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 8 * n, n)
-    r, c, buffer = _vector(floats, f + 9 * n, n), _vector(floats, f + 10 * n, n), _vector(floats, f + 11 * n, n + 2)
+    r, c, buffer = _vector(floats, f + 9 * n, n), _vector(floats, f + 10 * n, n), _vector(floats, f + 11 * n, width)
     zs = numba.carray(_pointer(z_out.ctypes.data, 0.0), z_out.shape)
     ws = numba.carray(_pointer(w_out.ctypes.data, 0.0), w_out.shape)
     us = numba.carray(_pointer(u_out.ctypes.data, 0.0), u_out.shape)
