@@ -1,5 +1,6 @@
 """What happens beside the optimisation: reports, early stopping, a clean stop on Ctrl-C."""
 
+import shutil
 import signal
 import threading
 from pathlib import Path
@@ -7,7 +8,7 @@ from types import FrameType
 from typing import Any
 
 import lightning.pytorch as pl
-from lightning.pytorch.callbacks import EarlyStopping, ProgressBar
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, ProgressBar
 from tqdm import tqdm
 
 from lcplearn.training.metrics import one_step
@@ -54,6 +55,20 @@ class EarlyStop(EarlyStopping):
         optimizer = pl_module.optimizer
         if optimizer.lbfgs_after is None or optimizer.finishes(trainer.current_epoch):
             super().on_validation_end(trainer, pl_module)
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Keep `best.ckpt`, also over a resumption in another folder: Lightning would forget what was best before."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        before = Path(state_dict["best_model_path"])
+        if before.is_file() and self.dirpath is not None and before.parent != Path(self.dirpath):
+            now = Path(self.dirpath) / before.name
+            now.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(before, now)
+            moved = {"dirpath": self.dirpath, "best_model_path": str(now), "kth_best_model_path": str(now)}
+            state_dict = state_dict | moved | {"best_k_models": {str(now): state_dict["best_model_score"]}}
+        super().load_state_dict(state_dict)
 
 
 class EpochBar(ProgressBar):

@@ -11,13 +11,12 @@ from typing import Any
 
 import lightning.pytorch as pl
 import yaml
-from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
 from lcplearn.datasets import BlockData, WindowLoader, windows
 from lcplearn.formulations import Formulation, loss_terms
 from lcplearn.training import figures
-from lcplearn.training.callbacks import EarlyStop, EpochBar, LastCheckpoint, Report
+from lcplearn.training.callbacks import BestCheckpoint, EarlyStop, EpochBar, LastCheckpoint, Report
 from lcplearn.training.checkpoint import check_resumable, describe, read
 from lcplearn.training.metrics import evaluate, table
 from lcplearn.training.module import FormulationModule
@@ -107,9 +106,9 @@ def fit(
     shuffle = batch_size is not None
     train_loader = WindowLoader(batches, batch_size=batch_size, shuffle=shuffle, seed=seed)
     chosen["log_every_n_steps"] = chosen.get("log_every_n_steps") or every * (1 if not shuffle else len(train_loader))
-    best = ModelCheckpoint(folder, "best", monitor="val/loss", enable_version_counter=False)
+    best = BestCheckpoint(folder, "best", monitor="val/loss", enable_version_counter=False)
     last = LastCheckpoint(folder / "last.ckpt", every)
-    callbacks: list[pl.Callback] = [best, last, Report(data)]
+    callbacks: list[pl.Callback] = [best, last, Report(data), *chosen.pop("callbacks", [])]
     if chosen.get("enable_progress_bar", True):
         callbacks.append(EpochBar())
     if patience is not None:
@@ -200,6 +199,6 @@ def _quiet() -> None:
         r".*does not have many workers",
         r".*smaller than the logging interval",
         r".*Checkpoint directory .* exists and is not empty",
-        r".*ModelCheckpoint.* manual optimization",
+        r".*The dirpath has changed from",
     ):
         warnings.filterwarnings("ignore", message=message)

@@ -1,0 +1,182 @@
+"""fit(): what it leaves, that it reproduces itself, and that it can be resumed."""
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from training.helpers import QUIET, short_fit, small_data, tiny_data
+
+from lcplearn.formulations import FORMULATIONS, MLP, Formulation, Physical, Structured
+from lcplearn.training import Optimizer, TrainingInterrupted, fit, load
+from lcplearn.training.metrics import KEYS, UNITS, format_table
+
+FRICTION = {"direct": "physical", "slack": "slack"}
+
+
+def parameters(model: Formulation) -> torch.Tensor:
+    return torch.cat([p.detach().reshape(-1) for p in model.parameters()])
+
+
+def test_the_structured_model_finds_mass_and_friction_to_machine_precision(tmp_path: Path) -> None:
+    """README: velocity RMSE <= 1e-8, stick 1, false stick 0, rollout <= 1e-6, mu and mass error <= 1e-7."""
+    data = small_data(trajectories=10, length=60)
+    model = Structured(dt=data.dt)
+    metrics = fit(model, data, loss={"prediction": 1.0}, epochs=160, folder=tmp_path / "run",
+                  optimizer=Optimizer(lbfgs_after=100), trainer=QUIET).metrics  # fmt: skip
+    assert metrics is not None
+    assert metrics["velocity_rmse"] <= 1e-8
+    assert metrics["stick_accuracy"] == 1.0
+    assert metrics["false_stick"] == 0.0
+    assert metrics["rollout_rmse_1000"] <= 1e-6
+    assert metrics["mu_error"] <= 1e-7
+    assert metrics["mass_error"] <= 1e-7
+
+
+def test_a_run_leaves_figures_checkpoints_settings_and_pictures(tmp_path: Path) -> None:
+    data = small_data()
+    result = short_fit(Structured(dt=data.dt), data, tmp_path / "run")
+    names = {path.name for path in result.folder.iterdir()}
+    assert names >= {"best.ckpt", "last.ckpt", "metrics.json", "config.yaml"}
+    assert names >= {"one_step_map.png", "rollouts.png", "error_over_horizon.png"}
+    metrics = json.loads((result.folder / "metrics.json").read_text())
+    assert tuple(metrics) == KEYS
+    assert metrics["rest_share"] is None  # slides only
+    assert metrics["rollout_rmse_100"] is not None
+    assert set(UNITS) == set(KEYS)
+    assert all(key in format_table(metrics) for key in KEYS if metrics[key] is not None)
+
+
+def test_a_folder_with_a_run_is_not_overwritten(tmp_path: Path) -> None:
+    data = tiny_data()
+    short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=1)
+    with pytest.raises(ValueError, match="holds a run already"):
+        short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=1)
+
+
+@pytest.mark.parametrize("name", FORMULATIONS)
+def test_every_model_comes_back_from_its_checkpoint_with_default_loading(name: str, tmp_path: Path) -> None:
+    data = tiny_data(friction=FRICTION.get(name))
+    model = FORMULATIONS[name](dt=data.dt)
+    short_fit(model, data, tmp_path, epochs=1)
+    torch.load(tmp_path / "last.ckpt")  # weights_only is torch's default
+    loaded = load(tmp_path / "best.ckpt", map_location="cpu")
+    assert type(loaded) is type(model)
+    test = data.test
+    friction = None if test.friction is None else test.friction[:, 0]
+    ours, theirs = (m.next_velocity(test.velocities[:, 0], test.forces[:, 0], friction) for m in (model, loaded))
+    assert torch.equal(ours, theirs)
+
+
+def final_state(folder: Path) -> torch.Tensor:
+    state = torch.load(folder / "last.ckpt")["state_dict"]
+    return torch.cat([value.reshape(-1) for value in state.values()])
+
+
+@pytest.mark.parametrize("batch_size", [None, 32])
+@pytest.mark.parametrize("stopped_after", [2, 3])
+def test_a_resumed_training_equals_an_uninterrupted_one(
+    stopped_after: int, batch_size: int | None, tmp_path: Path
+) -> None:
+    """Adam for two epochs, then LBFGS: resumed at the switch and behind it, also with shuffled batches."""
+    data = tiny_data(noise=0.01)
+    for folder, epochs, checkpoint in (("whole", 4, None), ("first", stopped_after, None), ("second", 4, "first")):
+        path = None if checkpoint is None else tmp_path / checkpoint / "last.ckpt"
+        model = Structured(dt=data.dt)
+        short_fit(model, data, tmp_path / folder, epochs=epochs, batch_size=batch_size, ckpt_path=path)
+    assert torch.equal(final_state(tmp_path / "second"), final_state(tmp_path / "whole"))
+
+
+class Terminate(Callback):
+    """Send the signal that a cluster sends, in the first epoch."""
+
+    def on_train_batch_start(self, *arguments: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_training_stopped_by_a_signal_says_how_to_resume_and_loses_nothing(tmp_path: Path) -> None:
+    data = tiny_data()
+    before = signal.getsignal(signal.SIGTERM)
+    trainer = QUIET | {"check_val_every_n_epoch": 1, "callbacks": [Terminate()]}
+    with pytest.raises(TrainingInterrupted, match=r"resume with ckpt_path=.*last.ckpt") as stopped:
+        short_fit(Structured(dt=data.dt), data, tmp_path / "stopped", trainer=trainer)
+    assert signal.getsignal(signal.SIGTERM) is before
+    short_fit(Structured(dt=data.dt), data, tmp_path / "resumed", ckpt_path=stopped.value.checkpoint)
+    short_fit(Structured(dt=data.dt), data, tmp_path / "whole")
+    assert torch.equal(final_state(tmp_path / "resumed"), final_state(tmp_path / "whole"))
+
+
+def test_the_best_model_before_an_interruption_stays_the_best_after_it(tmp_path: Path) -> None:
+    data = tiny_data()
+    short_fit(Structured(dt=data.dt), data, tmp_path / "first", epochs=3)
+    first = torch.load(tmp_path / "first" / "best.ckpt")["state_dict"]
+    absurd = Optimizer(lr=50.0, lbfgs_after=5)  # whatever comes after the resumption is worse
+    model = Structured(dt=data.dt)
+    checkpoint = tmp_path / "first" / "last.ckpt"
+    result = short_fit(model, data, tmp_path / "second", epochs=5, ckpt_path=checkpoint, optimizer=absurd)
+    assert all(torch.equal(value, first[f"model.{name}"]) for name, value in result.model.state_dict().items())
+
+
+def test_equal_seeds_give_equal_parameters_and_others_do_not(tmp_path: Path) -> None:
+    data = tiny_data()
+    found = []
+    for run, seed in enumerate((3, 3, 4)):
+        torch.manual_seed(seed)
+        model = MLP(dt=data.dt, width=8)
+        short_fit(model, data, tmp_path / str(run), batch_size=16, seed=seed, epochs=2)
+        found.append(parameters(model))
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])
+
+
+def test_a_finished_or_foreign_checkpoint_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    data = tiny_data()
+    short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=2)
+    last = tmp_path / "run" / "last.ckpt"
+    cases = [
+        (Physical(dt=data.dt), 2, "has finished its 2 epochs: set trainer.max_epochs above 2"),
+        (Physical(dt=data.dt, initial_mu=0.2), 4, "trained with model.initial_mu=its default, but the settings say 0.2"),
+        (MLP(dt=data.dt), 4, "Physical, but the settings ask for .*MLP"),
+    ]
+    for model, epochs, message in cases:
+        with pytest.raises(ValueError, match=message):
+            short_fit(model, data, tmp_path / "again", epochs=epochs, ckpt_path=last)
+
+
+def test_a_loss_that_the_model_does_not_have_is_refused_before_training(tmp_path: Path) -> None:
+    data = tiny_data()
+    with pytest.raises(ValueError, match="violation"):
+        short_fit(MLP(dt=data.dt), data, tmp_path / "run", loss={"violation": 1.0})
+    assert not (tmp_path / "run").exists()
+
+
+def test_annealing_leaves_the_plateau_where_no_sample_slips(tmp_path: Path) -> None:
+    data = tiny_data(length=5, initial_speed=0.0, trajectories=20)
+    errors = {}
+    for epochs in (0, 100):
+        model = Physical(dt=data.dt, initial_mu=5.0, initial_mass=1.5, learn_mass=False)
+        optimizer = Optimizer(lbfgs_after=140, anneal_epochs=epochs)
+        fit(model, data, epochs=160, optimizer=optimizer, folder=tmp_path / str(epochs), trainer=QUIET)
+        errors[epochs] = abs(model.physical_parameters()["mu"] - 0.4)
+    assert errors[0] == pytest.approx(4.6)
+    assert errors[100] < 1e-6
+
+
+def test_tensorboard_shows_losses_modes_residuals_parameters_figures_and_the_table(tmp_path: Path) -> None:
+    data = small_data()
+    logger = TensorBoardLogger(tmp_path, name="", version="tensorboard", default_hp_metric=False)
+    short_fit(Structured(dt=data.dt), data, tmp_path / "run", logger=logger)
+    events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
+    tags = events.Reload().Tags()
+    assert set(tags["scalars"]) >= {
+        "loss/total", "loss/prediction", "val/loss", "val/velocity_rmse", "mode/stick_accuracy", "mode/false_stick",
+        "residual/lcp", "solve/unsolved_share", "param/mu", "param/mu_true", "param/mass", "param/mass_true",
+        "hp/best_val_loss", "test/velocity_rmse",
+    }  # fmt: skip
+    assert set(tags["images"]) == {"one_step_map", "rollouts", "error_over_horizon"}
+    assert "results/text_summary" in tags["tensors"]
