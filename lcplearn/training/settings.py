@@ -35,14 +35,14 @@ def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool =
     """
     for key in settings:
         _known(key, known, "setting")
-    _check_friction(settings)
-    for group in ("data", "model", "optimizer", "logger"):
-        if settings.get(group) is not None:
-            _check_target(group, settings[group])
     for key, kind in (("seed", "int"), ("threads", "int"), ("batch_size", "int | None"), ("patience", "int | None")):
         _check_type(key, settings.get(key), kind)
     if settings["threads"] < 1:
         raise SettingsError(f"threads must be at least 1, got {settings['threads']}.")
+    _check_friction(settings)
+    for group in ("data", "model", "optimizer", "logger"):
+        if settings.get(group) is not None:
+            _check_target(group, settings[group])
     _check_loss(settings["loss"])
     _check_arguments("trainer", settings["trainer"], TRAINER)
     strategy = str(settings["trainer"].get("strategy", "auto"))

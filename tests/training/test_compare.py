@@ -1,0 +1,55 @@
+"""Runs side by side."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from lcplearn import compare
+from lcplearn.training.metrics import KEYS
+
+
+def run(folder: Path, target: str, config: dict[str, Any] | None = None, **figures: float) -> None:
+    folder.mkdir(parents=True)
+    model = {"_target_": f"lcplearn.formulations.{target}"}
+    (folder / "config.yaml").write_text(yaml.safe_dump({"model": model, "seed": 0} | (config or {})))
+    (folder / "metrics.json").write_text(json.dumps(dict.fromkeys(KEYS) | figures))
+
+
+def test_runs_that_differ_in_their_seed_share_a_row_of_medians(tmp_path: Path) -> None:
+    for seed, error in enumerate((1e-9, 3e-9, 1e-3)):
+        run(tmp_path / f"a{seed}", "structured.Structured", {"seed": seed}, velocity_rmse=error, predict_us=400.0)
+    run(tmp_path / "b", "baselines.MLP", velocity_rmse=0.1, predict_us=40.0)
+    rows = compare.read_runs([tmp_path])
+    assert [(row.label, row.runs, row.values["velocity_rmse"]) for row in rows] == [
+        ("Structured", 3, 3e-9),
+        ("MLP", 1, 0.1),
+    ]
+
+
+def test_a_row_is_named_by_what_sets_it_apart(tmp_path: Path) -> None:
+    for horizon in (1, 10):
+        run(tmp_path / str(horizon), "baselines.MLP", {"loss": {"horizon": horizon}, "threads": horizon})
+    assert [row.label for row in compare.read_runs([tmp_path])] == ["MLP loss.horizon=1", "MLP loss.horizon=10"]
+
+
+def test_the_table_holds_only_figures_that_a_run_has(tmp_path: Path) -> None:
+    run(tmp_path / "a", "baselines.MLP", velocity_rmse=0.5, parameters=7)
+    text = compare.format_table(compare.read_runs([tmp_path]))
+    assert text.splitlines()[0].split() == ["|", "run", "|", "seeds", "|", "one-step", "[m/s]", "|", "parameters", "|"]
+    assert text.splitlines()[2].split() == ["|", "MLP", "|", "1", "|", "0.5", "|", "7", "|"]
+
+
+def test_the_command_prints_the_table_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(tmp_path / "a", "baselines.MLP", velocity_rmse=0.5, predict_us=9.0, train_seconds=1.0, rollout_rmse_100=1.0)
+    compare.main([str(tmp_path / "a"), "--out", str(tmp_path / "out")])
+    assert "| MLP" in capsys.readouterr().out
+    assert (tmp_path / "out" / "compare.md").is_file()
+    assert (tmp_path / "out" / "compare.png").stat().st_size > 5000
+
+
+def test_a_folder_without_runs_gets_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="holds no finished run"):
+        compare.main([str(tmp_path)])

@@ -1,0 +1,135 @@
+"""The configuration: every file composes, passes the check and builds what it names; mistakes get one sentence."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from training.helpers import ROOT
+
+from lcplearn.formulations import FORMULATIONS, LOSS_TERMS, Formulation
+from lcplearn.training import settings as checks
+from lcplearn.training.optimizer import Optimizer
+
+CONF = ROOT / "conf"
+TOP_LEVEL = {"seed", "threads", "batch_size", "patience", "ckpt_path", "data", "model", "loss", "optimizer", "trainer",
+             "logger"}  # fmt: skip
+
+
+def names(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def settings(*overrides: str) -> dict[str, Any]:
+    """The resolved settings; hydra's own part, the run's folder, is made up."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("train", overrides=["++logger.save_dir=runs", *overrides])
+    resolved = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(resolved, dict)
+    if resolved["logger"].keys() == {"save_dir"}:
+        resolved["logger"] = None
+    return resolved
+
+
+EVERY = [f"{group}={name}" for group in ("model", "loss", "optimizer", "trainer", "logger") for name in names(group)]
+EVERY += [f"experiment={name}" for name in names("experiment")] + ["data=cube_slides model=mlp"]
+
+
+@pytest.mark.parametrize("choice", EVERY)
+def test_every_configuration_passes_the_check_and_builds_its_model(choice: str) -> None:
+    chosen = settings(*choice.split())
+    assert set(chosen) == TOP_LEVEL
+    checks.check(chosen, TOP_LEVEL)
+    model = instantiate(chosen["model"], dt=0.05, gravity=9.81, _convert_="all")
+    assert isinstance(model, Formulation)
+    assert isinstance(instantiate(chosen["optimizer"], _convert_="all"), Optimizer)
+
+
+def test_every_formulation_has_a_configuration() -> None:
+    targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in names("model")}
+    assert targets == {cls.__name__ for cls in FORMULATIONS.values()}
+
+
+def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
+    for path in (CONF / "experiment").glob("*.yaml"):
+        text = path.read_text()
+        assert all(f"# {word}:" in text for word in ("Claim", "Command", "Expected", "Time")), path.name
+        assert f"experiment={path.stem}" in text
+
+
+def test_the_loss_terms_known_without_torch_are_those_of_the_losses() -> None:
+    assert checks.LOSS_TERMS == LOSS_TERMS
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ("+modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
+        ("+model.inital_mu=0.2", "Unknown setting 'model.inital_mu'; did you mean 'model.initial_mu'?"),
+        ("model.initial_mu=abc", "model.initial_mu must be float, got 'abc'."),
+        ("model.b_network=3", "model.b_network must be bool, got 3."),
+        ("trainer.max_epochs=two", "trainer.max_epochs must be int or None, got 'two'."),
+        ("+trainer.max_epoch=2", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),
+        ("loss.prediction=-1", "loss.prediction must be finite and at least 0, got -1."),
+        ("+loss.mse=1", "Unknown setting 'loss.mse'; known are loss.complementarity"),
+        ("loss.prediction=0", "All loss weights are zero"),
+        ("loss.horizon=0", "loss.horizon must be at least 1, got 0."),
+        ("seed=true", "seed must be int, got True."),
+        ("threads=0", "threads must be at least 1, got 0."),
+        ("ckpt_path=nope.ckpt", "ckpt_path=nope.ckpt is not a file; checkpoints are named runs/DATE_TIME/last.ckpt."),
+        ("model=direct data.friction=null", "model=direct needs friction labels: set data.friction=physical"),
+        ("data=cube_slides model=slack", "model=slack needs friction labels, which only data=sliding_block has."),
+    ],
+)
+def test_a_mistake_gets_one_sentence_with_a_suggestion(overrides: str, message: str) -> None:
+    with pytest.raises(checks.SettingsError) as error:
+        checks.check(settings(*overrides.split()), TOP_LEVEL)
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_checkpoint_is_compared_with_those_that_are_there(tmp_path: Path) -> None:
+    (tmp_path / "last.ckpt").touch()
+    with pytest.raises(checks.SettingsError, match="did you mean .*last.ckpt"):
+        checks.check(settings(f"ckpt_path={tmp_path / 'lst.ckpt'}"), TOP_LEVEL)
+
+
+def test_a_sweep_refuses_the_strategy_that_would_start_it_twice() -> None:
+    chosen = settings("trainer.strategy=ddp")
+    checks.check(chosen, TOP_LEVEL)
+    with pytest.raises(checks.SettingsError, match="use trainer.strategy=ddp_fork"):
+        checks.check(chosen, TOP_LEVEL, multirun=True)
+    checks.check(settings("trainer.strategy=ddp_fork"), TOP_LEVEL, multirun=True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ("modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
+        ("model=mpl", "There is no model=mpl; did you mean 'mlp'?"),
+        ("model.widht=3", "Unknown setting 'model.widht'; did you mean 'model.width'?"),
+        ("trainer.max_epoch=3", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),
+        (
+            "trainer.accumulate_grad_batches=2",
+            "'trainer.accumulate_grad_batches' is not set in conf/trainer; to add it, write "
+            "+trainer.accumulate_grad_batches=...",
+        ),
+    ],
+)
+def test_hydras_messages_become_sentences_with_a_suggestion(overrides: str, sentence: str) -> None:
+    with pytest.raises(Exception, match=".") as error:
+        settings(overrides)
+    assert checks.explain(str(error.value), CONF) == sentence
+
+
+def test_signatures_are_read_without_importing_their_modules() -> None:
+    found = checks.signature("lcplearn.formulations.baselines.MLP")
+    assert found is not None
+    assert {"dt", "gravity", "width", "depth", "activation"} <= set(found)
+    assert checks.signature("lcplearn.formulations.slack.NoSuchClass") is None
+    assert checks.signature("no_such_package.module.Class") is None
+    trainer = checks.signature(checks.TRAINER)
+    assert trainer is not None
+    assert "max_epochs" in trainer
