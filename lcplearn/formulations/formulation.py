@@ -25,10 +25,17 @@ class Formulation(nn.Module):
         gravity: Acceleration of gravity [m/s^2].
         needs_friction: True if a prediction needs measured friction.
         last_solution: The last LCP solved in a forward pass, detached; None if there was none.
+        arguments: Constructor arguments as they were given: with the class, what a checkpoint needs to rebuild it.
     """
 
     needs_friction: ClassVar[bool] = False
     last_solution: LCPSolution | None
+    arguments: dict[str, Any]
+
+    def __new__(cls, **arguments: Any) -> "Formulation":
+        model = super().__new__(cls)
+        model.__dict__["arguments"] = arguments  # nn.Module's own __setattr__ works only after its __init__
+        return model
 
     def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
         super().__init__()
