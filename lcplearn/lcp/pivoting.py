@@ -205,18 +205,21 @@ def _vector(memory, start, size):
 # and the test for that keeps LLVM from vectorising.
 
 
-@_jit
+@_jit_inline
 def _factor(A, k, rows, cols, threshold, complete):
-    """LU of A[:k, :k] in place with partial or complete pivoting; the number of pivots above the threshold."""
+    """LU of A[:k, :k] in place, with the reciprocal diagonal of U; the number of pivots above the threshold."""
     for c in range(k):
         cols[c] = c
     for c in range(k):
-        row, column, largest = c, c, abs(A[c, c])
-        last = k if complete else c + 1
+        row, column, largest = c, c, 0.0
         for i in range(c, k):
-            for j in range(c, last):
-                if abs(A[i, j]) > largest:
-                    row, column, largest = i, j, abs(A[i, j])
+            largest = abs(A[i, c]) if abs(A[i, c]) > largest else largest
+        if complete or not abs(A[c, c]) >= 0.1 * largest:  # else the diagonal will do
+            largest = 0.0
+            for i in range(c, k):
+                for j in range(c, k if complete else c + 1):
+                    if abs(A[i, j]) > largest:
+                        row, column, largest = i, j, abs(A[i, j])
         if not largest > threshold:
             return c
         rows[c] = row
@@ -228,6 +231,7 @@ def _factor(A, k, rows, cols, threshold, complete):
             for i in range(k):
                 A[i, c], A[i, column] = A[i, column], A[i, c]
         inverse = 1.0 / A[c, c]
+        A[c, c] = inverse
         for i in range(c + 1, k):
             factor = A[i, c] * inverse
             A[i, c] = factor
@@ -237,7 +241,7 @@ def _factor(A, k, rows, cols, threshold, complete):
     return k
 
 
-@_jit
+@_jit_inline
 def _solve(A, k, rank, rows, cols, x, scratch):
     """Solve with the factors of `_factor`, x in place; beyond the rank the unknowns are zero."""
     for c in range(rank):
@@ -251,7 +255,7 @@ def _solve(A, k, rank, rows, cols, x, scratch):
         total = 0.0
         for j in range(np.uint64(i + 1), np.uint64(rank)):
             total += A[i, j] * x[j]
-        x[i] = (x[i] - total) / A[i, i]
+        x[i] = (x[i] - total) * A[i, i]
     for c in range(k):
         scratch[c] = x[c] if c < rank else 0.0
     for c in range(k):
@@ -261,15 +265,14 @@ def _solve(A, k, rank, rows, cols, x, scratch):
 @_jit_inline
 def _gather(S, basis, A, index):
     """Copy S_AA to A and A's members to index; its size."""
-    n = S.shape[0]
     k = 0
-    for i in range(n):
-        if basis[i]:
-            index[k] = i
-            k += 1
+    for i in range(S.shape[0]):  # without a branch, as it would be mispredicted half of the time; so below
+        index[k] = i
+        k += basis[i]
     for a in range(k):
+        i = index[a]
         for b in range(k):
-            A[a, b] = S[index[a], index[b]]
+            A[a, b] = S[i, index[b]]
     return k
 
 
@@ -308,11 +311,13 @@ def _equilibrate(M, size, largest, d):
     for _ in range(RUIZ_SWEEPS):
         for j in range(n):
             largest[j] = 0.0
-        for i in range(n):
-            di = d[i]
+        for i in range(0, n, 2):  # two rows at a time; the last twice if n is odd
+            k = min(i + 1, n - 1)
+            di, dk = d[i], d[k]
             for j in range(n):
-                scaled = size[i, j] * di
-                largest[j] = scaled if scaled > largest[j] else largest[j]
+                one, other = size[i, j] * di, size[k, j] * dk
+                one = one if one > other else other
+                largest[j] = one if one > largest[j] else largest[j]
         moved = 0
         for j in range(n):
             scaled = largest[j] * d[j]
@@ -362,7 +367,7 @@ def _scale(M, q, r, c, S, p):
     return s
 
 
-@_jit
+@_jit_inline
 def _evaluate(S, p, z, w, omega):
     """w = S z + p and the size of what was added up, omega = |S| z + |p|."""
     n = p.size
@@ -465,7 +470,7 @@ def _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch):
 
 
 @_jit_inline
-def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, cap):
+def _block_pivoting(S, p, basis, A, rows, cols, index, wrong, z, w, omega, x, scratch, cap):
     """Flip all infeasible members of the basis at a time, from the given one; how it ended and the rounds."""
     n = p.size
     fewest, patience = n + 1, 4
@@ -485,9 +490,10 @@ def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, 
         _evaluate(S, p, z, w, omega)
         count, last = 0, -1
         for i in range(n):
-            if z[i] < -8.0 * EPS * z_size if basis[i] else w[i] < -8.0 * EPS * omega[i]:
-                count += 1
-                last = i
+            below = (z[i] < -8.0 * EPS * z_size) if basis[i] else (w[i] < -8.0 * EPS * omega[i])
+            wrong[i] = below
+            count += wrong[i]
+            last = i if below else last
         if count == 0:
             _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch)
             return DONE, iteration + 1
@@ -496,11 +502,10 @@ def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, 
         else:
             patience -= 1
         if patience < 0:  # Kostreva: single flips of the last one end for every P-matrix
-            basis[last] = not basis[last]
-            continue
-        for i in range(n):
-            if z[i] < -8.0 * EPS * z_size if basis[i] else w[i] < -8.0 * EPS * omega[i]:
-                basis[i] = not basis[i]
+            basis[last] ^= 1
+        else:
+            for i in range(n):
+                basis[i] ^= wrong[i]
     return CAPPED, cap
 
 
@@ -512,7 +517,7 @@ def _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch, 
 # is -T[:, c] and that of a basic one a unit vector, so the lexicographic rule needs nothing else.
 
 
-@_jit
+@_jit_inline
 def _start_tableau(S, p, cover, T, basic, column, place):
     """Dictionary at w = p + S z + cover z_0, with z_0 already exchanged for the lexicographically smallest row."""
     n, width = T.shape
@@ -537,7 +542,7 @@ def _start_tableau(S, p, cover, T, basic, column, place):
     return row
 
 
-@_jit
+@_jit_inline
 def _exchange(T, basic, column, place, row, c, buffer):
     """Pivot: the nonbasic variable of column c becomes basic in this row."""
     n, width = T.shape  # columns beyond n + 2 are zeros
@@ -557,7 +562,7 @@ def _exchange(T, basic, column, place, row, c, buffer):
     place[basic[row]], place[column[c]] = row, -1 - c
 
 
-@_jit
+@_jit_inline
 def _leaving_row(T, basic, place, c, tolerance, ratio, tied):
     """Row that first reaches zero as the variable of column c grows, by the lexicographic rule; -1 on a ray."""
     n = basic.size
@@ -762,7 +767,9 @@ def _solve_one(
             if stage == 4:
                 for i in range(n):
                     basis[i] = p[i] < 0.0
-            ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, z, w, omega, x, y, min(20, left))
+            ended, count = _block_pivoting(
+                S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left)
+            )
         elif stage < 6:
             pivot = _prepare_lemke(stage, single_precision, cover)
             cap = left if budget >= 0 else 10 * n + 50
