@@ -1,1 +1,1 @@
-"""Speed against error: seeded problems, solvers and scenes side by side."""
+"""Speed against error: seeded problems, solvers and scenes side by side; see `python -m lcplearn.benchmark --help`."""

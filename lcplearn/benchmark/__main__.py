@@ -1,0 +1,88 @@
+"""Speed against error, from solvers to learned models.
+
+Each command prints tables and writes results.csv, figures, a summary and a TensorBoard run to --output. A run that was
+stopped continues where it was when the same command is given again.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+# Each is the module of that name, with run(options: Options).
+STUDIES = {
+    "solvers": "time against residual, forward and backward, for each method and peer",
+    "acceptance": "each figure the layer must show, measured",
+    "stability": "hard cases, sweeps of condition and scale, the noise study: where each method breaks",
+    "scenes": "what a scene-minimal LCP saves, and error against step size and time",
+    "models": "learned formulations: error against time, samples and noise",
+    "overhead": "one problem a call, and memory",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command; what a user did wrong ends in one sentence."""
+    options = _parser().parse_args(arguments)
+    try:
+        _run(options)
+    except (ValueError, OSError) as error:
+        sys.exit(f"benchmark {options.command}: {error}")
+    except KeyboardInterrupt:
+        sys.exit(f"benchmark {options.command}: stopped; the same command continues")
+
+
+def _run(options: argparse.Namespace) -> None:
+    if options.command == "report":
+        from lcplearn.benchmark.report import write_report
+
+        write_report(options.folders, options.output)
+        print(options.output)
+        return
+    # Before numpy and torch are imported, which read them.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(options.threads)
+    import torch
+
+    torch.set_num_threads(options.threads)
+    if options.command == "fuzz":
+        from lcplearn.benchmark import fuzz
+
+        fuzz.run(options)
+        return
+    from lcplearn.benchmark.study import Options
+
+    default = Path("runs/benchmark") / (options.command + ("-quick" if options.quick else ""))
+    chosen = Options(options.output or default, options.quick, options.threads, options.seed)
+    import_module(f"lcplearn.benchmark.{options.command}").run(chosen)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m lcplearn.benchmark", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, what in STUDIES.items():
+        command = commands.add_parser(name, help=what, description=what)
+        command.add_argument("--output", type=Path, metavar="DIR", help="folder (default: runs/benchmark/COMMAND)")
+        command.add_argument("--quick", action="store_true", help="small sizes, less than a minute")
+        _add_threads_and_seed(command)
+    fuzz = commands.add_parser("fuzz", help="hunt for wrong statuses, NaN, crashes and batch dependence")
+    fuzz.add_argument("--minutes", type=float, default=1.0, help="how long to hunt (default: 1)")
+    fuzz.add_argument("--output", type=Path, default=Path("runs/benchmark/fuzz"), metavar="DIR", help="for findings")
+    fuzz.add_argument("--replay", type=Path, metavar="FILE", help="check one finding again, instead of hunting")
+    _add_threads_and_seed(fuzz)
+    report = commands.add_parser("report", help="gather studies into one self-contained HTML page")
+    report.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="folders that commands wrote")
+    report.add_argument("--output", type=Path, default=Path("report.html"), metavar="FILE", help="default: report.html")
+    return parser
+
+
+def _add_threads_and_seed(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--threads", type=int, default=1, metavar="N", help="of torch and BLAS (default: 1)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of the generated problems (default: 0)")
+
+
+if __name__ == "__main__":
+    main()
