@@ -37,6 +37,12 @@ _HEADERS = {
     "train_seconds": "train [s]",
     "predict_us": "step [us]",
 }
+# The far error that a picture shows: the first of these that a run has.
+_FAR = {
+    "stop_error_median_mm": "where a slide stops: median error [mm]",
+    "rollout_rmse_1000": "error over 1000 steps [m/s]",
+    "rollout_rmse_100": "error over 100 steps [m/s]",
+}
 
 
 class Row(NamedTuple):
@@ -93,27 +99,30 @@ def draw(rows: Sequence[Row]) -> "Figure":
     """Accuracy against cost: the error of a step against its time, that of a rollout against the time of training."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-    slides = any(row.values.get("stop_error_median_mm") is not None for row in rows)
-    longest = ("rollout_rmse_1000", "rollout_rmse_100")
-    far = "stop_error_median_mm" if slides else next((k for k in longest if any(r.values.get(k) for r in rows)), "")
+    far = next((key for key in _FAR if any(row.values.get(key) for row in rows)), None)
     panels = [("predict_us", "velocity_rmse", "time of a step [us]", "error of a step [m/s]")]
-    if far:
-        panels.append(("train_seconds", far, "time of training [s]", far.replace("_", " ")))
-    figure = Figure(figsize=(6.0 * len(panels), 4.6), layout="constrained")
+    if far is not None:
+        panels.append(("train_seconds", far, "time of training [s]", _FAR[far]))
+    figure = Figure(figsize=(4.6 * len(panels) + 2.6, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
-    for ax, (x, y, xlabel, ylabel) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for ax, (x, y, xlabel, ylabel) in zip(all_axes, panels, strict=True):
         for index, row in enumerate(rows):
-            if row.values.get(x) is None or row.values.get(y) is None:
-                continue
-            # Filled where it sticks: what tells the formulations apart more than any error.
+            # Filled where it sticks, which tells the formulations apart more than any error.
             sticks = (row.values.get("stick_accuracy") or row.values.get("rest_share") or 0.0) >= 0.98
-            colour = f"C{index % 10}"
-            ax.plot(row.values[x], row.values[y], "o", color=colour, fillstyle="full" if sticks else "none", label=row.label)
-            ax.annotate(row.label, (row.values[x], row.values[y]), xytext=(6, 4), textcoords="offset points", fontsize=8)
+            ax.plot(
+                _shown(row.values.get(x)), _shown(row.values.get(y)), "osD^v"[index // 10 % 5],
+                color=f"C{index % 10}", fillstyle="full" if sticks else "none", markersize=9, mew=1.8, label=row.label,
+            )  # fmt: skip
         ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
-        ax.margins(0.2)
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.margins(0.12)
         ax.grid(alpha=0.3)
+    figure.legend(*all_axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=9)
     figure.suptitle("Accuracy against cost (filled: sticks in at least 98 % of cases; lower left is better)", fontsize=11)
     return figure
 
@@ -168,7 +177,7 @@ def _labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
         for key in sorted({key for other in flat for key in other}):
             if key.startswith(_SILENT) or key == "model._target_":
                 continue
-            own = key.startswith("model.")  # arguments of another class are no difference
+            own = key.startswith(("model.", "data.friction"))  # what a model brings along is no difference to others
             values = [other.get(key) for other, name in zip(flat, models, strict=True) if name == model or not own]
             if any(value != values[0] for value in values):
                 parts.append(f"{key}={config.get(key)}")
@@ -186,6 +195,11 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def _medians(runs: Sequence[Mapping[str, Value]]) -> dict[str, Value]:
     columns = {key: [run[key] for run in runs if run.get(key) is not None] for key in _HEADERS}
     return {key: statistics.median(values) if values else None for key, values in columns.items()}
+
+
+def _shown(value: Value) -> float:
+    """A logarithmic axis has no zero."""
+    return float("nan") if value is None else max(value, 1e-17)
 
 
 def _number(value: Value) -> str:

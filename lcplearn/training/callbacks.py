@@ -76,6 +76,9 @@ class EpochBar(ProgressBar):
 
     bar: tqdm | None = None
 
+    def disable(self) -> None:
+        """Lightning asks for this on all processes but the first, which `on_train_start` knows by itself."""
+
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.bar = tqdm(
             total=trainer.max_epochs, initial=trainer.current_epoch, desc="training", unit="epoch", mininterval=0.5,

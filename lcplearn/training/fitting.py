@@ -193,7 +193,8 @@ def _settings(model: Formulation, **arguments: Any) -> dict[str, Any]:
 
 def _quiet() -> None:
     """Silence, by message, what a user can't act on."""
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "fabric.utilities.distributed"):
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     for message in (
         r".*isinstance\(treespec, LeafSpec\)",
         r".*does not have many workers",

@@ -1,0 +1,74 @@
+"""train.py as a user runs it; each call pays the imports, so there are few."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+from training.helpers import ROOT
+
+SMALL = ["data.trajectories=4", "data.length=30", "+data.long_length=20", "trainer.check_val_every_n_epoch=1"]
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
+
+
+def train(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "train.py"), *overrides]
+    return subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=120)
+
+
+def test_a_mistyped_setting_ends_in_one_sentence_without_torch(tmp_path: Path) -> None:
+    code = "import runpy, sys; sys.argv = ['train.py', 'modle=relu']\ntry: runpy.run_path(%r, run_name='__main__')\n"
+    code += "finally: print('torch' in sys.modules)"
+    script = code % str(ROOT / "train.py")
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "Unknown setting 'modle'; did you mean 'model'?"
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_sweep_over_two_processes_each_ends_with_the_comparison(tmp_path: Path) -> None:
+    done = train(tmp_path, "-m", "model=affine,physical", "trainer.max_epochs=3", "optimizer.lbfgs_after=2",
+                 "trainer.strategy=ddp_fork", "trainer.devices=2", *SMALL)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert {path.name for path in folder.iterdir()} >= {"0", "1", "compare.md", "compare.png"}
+    for number, model in enumerate(("Affine", "Physical")):
+        assert len(list((folder / str(number)).glob("metrics.json"))) == 1
+        config = yaml.safe_load((folder / str(number) / "config.yaml").read_text())
+        assert config["model"]["_target_"].endswith(model)
+        assert model in (folder / "compare.md").read_text()
+    noise = [line for line in done.stderr.splitlines() if line and "epoch" not in line]
+    assert not noise, noise  # no adverts and no warnings
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_the_command_that_goes_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-u", str(ROOT / "train.py"), "model=physical", "trainer.max_epochs=5000",
+               "optimizer=adam", "patience=null", *SMALL]  # fmt: skip
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    while "val/loss" not in process.stderr.read(40):
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 1
+    hint = re.search(r"Stopped; to go on: python train.py (.* ckpt_path=\S+last.ckpt)", errors)
+    assert hint is not None, errors
+    assert (tmp_path / hint[1].rpartition("ckpt_path=")[2]).is_file()
+
+
+def test_a_run_says_what_it_does_and_where_it_put_it(tmp_path: Path) -> None:
+    done = train(tmp_path, "trainer.max_epochs=3", "optimizer.lbfgs_after=2", *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Structured: 5 parameters (float64); sliding_block: 120 training steps")
+    folder = tmp_path / re.findall(r"run folder: (\S+)", done.stdout)[0]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert re.search(r"velocity_rmse\s+" + re.escape(f"{metrics['velocity_rmse']:.4g}"), done.stdout)
+    assert (folder / ".hydra" / "overrides.yaml").is_file()
+    assert list((folder / "tensorboard").glob("events*"))
