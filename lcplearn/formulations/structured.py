@@ -130,7 +130,7 @@ class Structured(FrictionLCP):
         if self.c_net is None:
             values["mu"] = (self.log_a + self.log_c).exp().item() / (self.gravity * self.dt)
         if self.b_net is None and self.b_weight.requires_grad:
-            values["mass"] = 1.0 / self.b_weight[1].item()
+            values["mass"] = self.b_weight[1].reciprocal().item()
         return values
 
 
