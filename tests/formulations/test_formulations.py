@@ -1,5 +1,6 @@
 """Formulations: right at the true parameters, and sticking where the structure promises it."""
 
+import copy
 import math
 
 import pytest
@@ -257,6 +258,17 @@ def test_every_parameter_is_float64_and_seeded_by_the_global_generator(name: str
         parameters += FORMULATIONS[name](dt=DT).parameters()
     assert all(p.dtype == torch.float64 for p in first)
     assert all(torch.equal(p, other) for p, other in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("name", FORMULATIONS)
+def test_a_model_is_rebuilt_from_its_arguments_and_parameters(name: str) -> None:
+    velocity, force, _, _ = steps()
+    model = copy.deepcopy(FORMULATIONS[name](dt=DT, gravity=9.8))
+    torch.manual_seed(1)
+    again = type(model)(**model.arguments)
+    again.load_state_dict(model.state_dict())
+    friction = torch.ones(2000, 2, dtype=torch.float64) if model.needs_friction else None
+    assert torch.equal(again.next_velocity(velocity, force, friction), model.next_velocity(velocity, force, friction))
 
 
 def test_the_registry_names_every_model_of_the_comparison() -> None:
