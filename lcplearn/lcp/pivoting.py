@@ -21,6 +21,7 @@ block pivoting; Mehrotra (1992) for the predictor-corrector steps; Ruiz (2001) f
 import os
 import sys
 from collections.abc import Callable
+from functools import cache
 from math import frexp, ldexp, sqrt
 from typing import Any, NamedTuple
 
@@ -158,9 +159,10 @@ def _plain(array: np.ndarray) -> np.ndarray:
     return array if array.flags.writeable else array.copy()
 
 
+@cache
 def _announce_compilation() -> None:
     """Say once, on a terminal, that the first solve on this machine compiles."""
-    if _solve_range.signatures or not sys.stderr.isatty():
+    if not sys.stderr.isatty():
         return
     folder = getattr(_solve_range.stats, "cache_path", None)
     name = os.path.basename(__file__).removesuffix(".py") + "._solve_range"
@@ -550,12 +552,17 @@ def _exchange(T, basic, column, place, row, c, buffer):
     T[row, c] = -1.0
     for j in range(width):
         buffer[j] = -inverse * T[row, j]
-    for i in range(n):
-        factor = T[i, c]
-        if factor != 0.0 and i != row:
+    for j in range(width):
+        T[row, j] = 0.0  # so that its own factor is zero
+    for i in range(0, n, 2):  # two rows at a time
+        k = i + 1 if i + 1 < n else i
+        one, other = T[i, c], T[k, c] if k > i else 0.0
+        if one != 0.0 or other != 0.0:
             T[i, c] = 0.0
+            T[k, c] = 0.0
             for j in range(width):
-                T[i, j] += factor * buffer[j]
+                T[i, j] += one * buffer[j]
+                T[k, j] += other * buffer[j]
     for j in range(width):
         T[row, j] = buffer[j]
     basic[row], column[c] = column[c], basic[row]
