@@ -32,6 +32,7 @@ def main(config: DictConfig) -> float:
 
 
 def train(config: DictConfig) -> float:
+    """Check the configuration, then build, fit and test; errors are the caller's."""
     from lcplearn.training.settings import check
 
     run = HydraConfig.get()

@@ -17,7 +17,7 @@ from hydra.experimental.callback import Callback
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Value = float | int | None
+Value = float | None
 # Settings that don't make runs different things to compare.
 _SILENT = ("seed", "data.seed", "ckpt_path", "threads", "logger.", "trainer.")
 _HEADERS = {
@@ -123,7 +123,9 @@ def draw(rows: Sequence[Row]) -> "Figure":
         ax.margins(0.12)
         ax.grid(alpha=0.3)
     figure.legend(*all_axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=9)
-    figure.suptitle("Accuracy against cost (filled: sticks in at least 98 % of cases; lower left is better)", fontsize=11)
+    figure.suptitle(
+        "Accuracy against cost (filled: sticks in 98 % of cases or more; lower left is better)", fontsize=11
+    )
     return figure
 
 
@@ -147,6 +149,7 @@ def report(folders: Iterable[str | Path], out: str | Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; a folder that can't be compared ends it with one sentence."""
     parser = argparse.ArgumentParser(prog="python -m lcplearn.compare", description=__doc__.split("\n\n")[0])
     parser.add_argument("runs", nargs="+", metavar="RUNS", help="run folders, or folders above them")
     parser.add_argument("--out", default=".", help="folder for compare.md and compare.png (default: here)")
@@ -193,7 +196,7 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _medians(runs: Sequence[Mapping[str, Value]]) -> dict[str, Value]:
-    columns = {key: [run[key] for run in runs if run.get(key) is not None] for key in _HEADERS}
+    columns = {key: [value for run in runs if (value := run.get(key)) is not None] for key in _HEADERS}
     return {key: statistics.median(values) if values else None for key, values in columns.items()}
 
 

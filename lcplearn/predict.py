@@ -133,7 +133,8 @@ def read_data(path: str | Path, model: Formulation) -> BlockData:
     else:
         needed = {"positions", "velocities", "forces", "dt"}
         if needed - content:
-            raise ValueError(f"{path} lacks {', '.join(sorted(needed - content))}; it has {', '.join(sorted(content))}.")
+            missing, there = (", ".join(sorted(names)) for names in (needed - content, content))
+            raise ValueError(f"{path} lacks {missing}; it has {there}.")
         data = _simulated(path, model)
     if abs(data.dt / model.dt - 1.0) > 1e-9:
         raise ValueError(f"{path} has time steps of {data.dt:.6g} s, but the model was trained for {model.dt:.6g} s.")
@@ -143,6 +144,7 @@ def read_data(path: str | Path, model: Formulation) -> BlockData:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; what is wrong with a file ends it with one sentence."""
     parser = argparse.ArgumentParser(
         prog="python -m lcplearn.predict", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -205,17 +207,16 @@ def _draw(inputs: Inputs, trajectory: Trajectory, dt: float) -> Any:
 
 def _read_csv(path: Path) -> dict[str, Any]:
     with path.open(newline="") as file:
-        reader = csv.DictReader(file)
-        rows, header = list(reader), [name.strip() for name in reader.fieldnames or []]
-    reader_names = dict(zip(header, reader.fieldnames or [], strict=True))
+        reader = csv.DictReader(file, skipinitialspace=True)
+        rows, header = list(reader), list(reader.fieldnames or [])
 
     def column(name: str) -> list[float]:
         values = []
         for line, row in enumerate(rows, start=2):
             try:
-                values.append(float(row[reader_names[name]]))
+                values.append(float(row[name]))
             except (TypeError, ValueError):
-                raise ValueError(f"{path}, line {line}: {name} must be a number, got {row[reader_names[name]]!r}.") from None
+                raise ValueError(f"{path}, line {line}: {name} must be a number, got {row[name]!r}.") from None
         return values
 
     if "force" not in header:

@@ -8,9 +8,12 @@ from types import FrameType
 from typing import Any
 
 import lightning.pytorch as pl
+from lightning.fabric.utilities import move_data_to_device
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, ProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm import tqdm
 
+from lcplearn.datasets import BlockData
 from lcplearn.training.metrics import one_step
 from lcplearn.training.module import FormulationModule
 
@@ -26,21 +29,21 @@ TAGS = {
 class Report(pl.Callback):
     """Log how the model does on the validation recordings, and learned mu and mass beside the true ones."""
 
-    def __init__(self, data: Any) -> None:
-        self.data = data
+    def __init__(self, data: BlockData) -> None:
+        self.data, self.validation = data, data.validation
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        writer = getattr(trainer.logger, "experiment", None)
-        if hasattr(writer, "add_custom_scalars"):
+        self.validation = move_data_to_device(self.data.validation, pl_module.device)
+        if isinstance(trainer.logger, TensorBoardLogger):
             pairs = {name: ["Multiline", [f"param/{name}$", f"param/{name}_true"]] for name in ("mu", "mass")}
-            writer.add_custom_scalars({"learned against true": pairs})
+            trainer.logger.experiment.add_custom_scalars({"learned against true": pairs})
 
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if trainer.sanity_checking or trainer.logger is None or not trainer.is_global_zero:
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
+        if trainer.logger is None or not trainer.is_global_zero:
             return
         model = pl_module.model
-        found = one_step(model, self.data.validation)
-        scalars = {tag: found[name] for name, tag in TAGS.items() if found[name] is not None}
+        found = one_step(model, self.validation)
+        scalars = {tag: value for name, tag in TAGS.items() if (value := found[name]) is not None}
         for name, value in model.physical_parameters().items():
             scalars[f"param/{name}"] = value
             if getattr(self.data, name) is not None:
@@ -89,7 +92,7 @@ class EpochBar(ProgressBar):
         if self.bar is not None:
             self.bar.update()
 
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
         if self.bar is not None and "val/loss" in trainer.callback_metrics:
             values = {"val/loss": float(trainer.callback_metrics["val/loss"])} | pl_module.model.physical_parameters()
             self.bar.set_postfix({name: f"{value:.3g}" for name, value in values.items()}, refresh=False)

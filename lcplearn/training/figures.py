@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from lcplearn.datasets import BlockData, Recordings
 from lcplearn.formulations import Formulation
 from lcplearn.formulations.formulation import STICK_SPEED
 from lcplearn.training.metrics import rollout, truth, valid_steps
@@ -13,10 +14,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TRUE, LEARNED = {"color": "black", "linewidth": 5.0, "alpha": 0.25}, {"color": "tab:red", "linewidth": 1.4}
+TRUE: dict[str, Any] = {"color": "black", "linewidth": 5.0, "alpha": 0.25}
+LEARNED: dict[str, Any] = {"color": "tab:red", "linewidth": 1.4}
 
 
-def draw(model: Formulation, data: Any) -> dict[str, "Figure"]:
+def draw(model: Formulation, data: BlockData) -> dict[str, "Figure"]:
     """Draw what applies to the data.
 
     Args:
@@ -33,7 +35,7 @@ def draw(model: Formulation, data: Any) -> dict[str, "Figure"]:
 
 
 @torch.no_grad()
-def one_step_map(model: Formulation, data: Any, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3)) -> "Figure":
+def one_step_map(model: Formulation, data: BlockData, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3)) -> "Figure":
     """Velocity after a step against the force, for a few velocities before it, with the true stick band."""
     figure, axes = _figure(1, 1, (7.0, 4.5))
     mass, mu = data.mass or 1.0, data.mu if data.mu is not None else model.physical_parameters().get("mu")
@@ -59,11 +61,11 @@ def one_step_map(model: Formulation, data: Any, speeds: tuple[float, ...] = (-0.
     return figure
 
 
-def rollouts(model: Formulation, data: Any, count: int = 3) -> "Figure":
+def rollouts(model: Formulation, data: BlockData, count: int = 3) -> "Figure":
     """Velocity of a few test recordings, predicted from their start; strips below show when the block rests."""
     figure, axes = _figure(count, 1, (8.0, 2.1 * count + 0.6))
     chosen = torch.linspace(0, len(data.test.steps) - 1, count).long()  # those from rest come first
-    test = type(data.test)(*(None if field is None else field[chosen] for field in data.test))
+    test = Recordings(*(None if field is None else field[chosen] for field in data.test))  # type: ignore[arg-type]
     _, velocity = rollout(model, test)
     true, name = truth(test), "recorded" if data.kind == "cube_slides" else "true"
     for row, ax in enumerate(ax for line in axes for ax in line):
@@ -80,16 +82,19 @@ def rollouts(model: Formulation, data: Any, count: int = 3) -> "Figure":
     return figure
 
 
-def _strip(ax: "Axes", time: Tensor, velocity: Tensor, bottom: float, colour: str, label: str, alpha: float = 1.0) -> None:
+def _strip(
+    ax: "Axes", time: Tensor, velocity: Tensor, bottom: float, colour: str, label: str, alpha: float = 1.0
+) -> None:
     """Mark the steps after which the block rests, at a height given in parts of the axes."""
     still, dt = velocity[1:].abs() < STICK_SPEED, float(time[1] - time[0])
     spans = [(float(start), dt) for start in time[:-1][still]] or [(0.0, 0.0)]
     ax.broken_barh(
-        spans, (bottom, 0.05), facecolors=colour, alpha=alpha, linewidth=0, transform=ax.get_xaxis_transform(), label=label
-    )
+        spans, (bottom, 0.05), facecolors=colour, alpha=alpha, linewidth=0,
+        transform=ax.get_xaxis_transform(), label=label,
+    )  # fmt: skip
 
 
-def error_over_horizon(model: Formulation, data: Any) -> "Figure":
+def error_over_horizon(model: Formulation, data: BlockData) -> "Figure":
     """Root mean square and largest error of the velocity against the steps since the start of the rollout."""
     figure, axes = _figure(1, 1, (7.0, 4.0))
     recordings = data.test_long if data.test_long is not None else data.test

@@ -11,10 +11,11 @@ from typing import Any
 
 import lightning.pytorch as pl
 import yaml
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.data import DataLoader
 
 from lcplearn.datasets import BlockData, WindowLoader, windows
-from lcplearn.formulations import Formulation, loss_terms
+from lcplearn.formulations import Formulation, Windows, loss_terms
 from lcplearn.training import figures
 from lcplearn.training.callbacks import BestCheckpoint, EarlyStop, EpochBar, LastCheckpoint, Report
 from lcplearn.training.checkpoint import check_resumable, describe, read
@@ -45,7 +46,7 @@ class Result:
     """
 
     model: Formulation
-    metrics: dict[str, float | int | None] | None
+    metrics: dict[str, float | None] | None
     validation: float
     folder: Path
 
@@ -92,20 +93,18 @@ def fit(
         ValueError: loss and model don't fit, a checkpoint that can't be resumed, or a folder that holds a run already.
         TrainingInterrupted: a signal ended the training.
     """
-    loss = dict(loss or {"prediction": 1.0})
-    optimizer = optimizer or Optimizer()
+    loss, optimizer = dict(loss or {"prediction": 1.0}), optimizer or Optimizer()
     folder = _new_folder(folder)
+    _quiet()
     batches, validation = windows(data.train, horizon), windows(data.validation, horizon)
-    loss_terms(model, type(batches)(*(None if field is None else field[:1] for field in batches)), loss)
+    loss_terms(model, _first(batches), loss)  # refuses what doesn't fit before anything is written
+    seconds_before = 0.0
     if ckpt_path is not None:
         check_resumable(ckpt_path, model, epochs)
-    _quiet()
-    chosen = {"max_epochs": epochs, **DEFAULTS, **(trainer or {})}
-    every = min(chosen.setdefault("check_val_every_n_epoch", 10), epochs)
-    chosen["check_val_every_n_epoch"] = every
-    shuffle = batch_size is not None
-    train_loader = WindowLoader(batches, batch_size=batch_size, shuffle=shuffle, seed=seed)
-    chosen["log_every_n_steps"] = chosen.get("log_every_n_steps") or every * (1 if not shuffle else len(train_loader))
+        seconds_before = read(ckpt_path)["train_seconds"]
+    loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
+    chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
+    every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
     best = BestCheckpoint(folder, "best", monitor="val/loss", enable_version_counter=False)
     last = LastCheckpoint(folder / "last.ckpt", every)
     callbacks: list[pl.Callback] = [best, last, Report(data), *chosen.pop("callbacks", [])]
@@ -116,26 +115,30 @@ def fit(
     lightning_trainer = pl.Trainer(
         default_root_dir=folder, callbacks=callbacks, logger=logger or False, num_sanity_val_steps=0, **chosen
     )
-    settings = settings or _settings(model, loss=loss, horizon=horizon, seed=seed, epochs=epochs)
+    module = FormulationModule(
+        model, loss=loss, horizon=horizon, optimizer=optimizer, log_every=every * (len(loader) if batch_size else 1)
+    )
     if lightning_trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
+        settings = settings or _settings(model, loss=loss, horizon=horizon, seed=seed, epochs=epochs)
         (folder / "config.yaml").write_text(yaml.safe_dump(dict(settings), sort_keys=False))
-    module = FormulationModule(model, loss=loss, horizon=horizon, optimizer=optimizer)
     start = time.perf_counter()
-    before = read(ckpt_path)["train_seconds"] if ckpt_path is not None else 0.0
     validation_loader = DataLoader([validation], batch_size=None)  # type: ignore[arg-type, var-annotated]  # one batch
-    lightning_trainer.fit(module, train_loader, validation_loader, ckpt_path=ckpt_path, weights_only=True)
-    seconds = before + time.perf_counter() - start
+    lightning_trainer.fit(module, loader, validation_loader, ckpt_path=ckpt_path, weights_only=True)
     if last.stopped:
         raise TrainingInterrupted(last.path)
-    return _finish(lightning_trainer, module, data, folder, seconds)
+    return _finish(lightning_trainer, module, best, data, folder, seconds_before + time.perf_counter() - start)
 
 
 def _finish(
-    trainer: pl.Trainer, module: FormulationModule, data: BlockData, folder: Path, seconds: float
+    trainer: pl.Trainer,
+    module: FormulationModule,
+    best: BestCheckpoint,
+    data: BlockData,
+    folder: Path,
+    seconds: float,
 ) -> Result:
     """Take the best parameters, judge them and write what a run leaves; only the first process writes."""
-    best = trainer.checkpoint_callback
     validation = float(best.best_model_score) if best.best_model_score is not None else float("nan")
     model = module.model.cpu().eval()
     if best.best_model_path:
@@ -155,7 +158,7 @@ def _finish(
 def _log_results(
     trainer: pl.Trainer,
     module: FormulationModule,
-    metrics: Mapping[str, float | int | None],
+    metrics: Mapping[str, float | None],
     validation: float,
     pictures: Mapping[str, Any],
 ) -> None:
@@ -167,16 +170,16 @@ def _log_results(
     weights = {f"loss.{name}": weight for name, weight in module.loss.items()}
     hyperparameters = {"model": described["class"].rpartition(".")[2], "horizon": module.horizon} | weights
     hyperparameters |= described["arguments"]
-    writer = getattr(trainer.logger, "experiment", None)
-    if hasattr(writer, "add_figure"):
-        trainer.logger.log_hyperparams(hyperparameters, {"hp/best_val_loss": validation} | numbers)
-        rows = "".join(f"\n| {name} | {value} | {meaning} |" for name, value, meaning in table(metrics))
-        writer.add_text("results", "| figure | value | meaning |\n|---|---|---|" + rows)
-        for name, figure in pictures.items():
-            writer.add_figure(name, figure, global_step=trainer.global_step)
-        writer.flush()
-    else:
+    if not isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_metrics(numbers)
+        return
+    trainer.logger.log_hyperparams(hyperparameters, {"hp/best_val_loss": validation} | numbers)
+    writer = trainer.logger.experiment
+    rows = "".join(f"\n| {name} | {value} | {meaning} |" for name, value, meaning in table(metrics))
+    writer.add_text("results", "| figure | value | meaning |\n|---|---|---|" + rows)
+    for name, figure in pictures.items():
+        writer.add_figure(name, figure, global_step=trainer.global_step)
+    writer.flush()
 
 
 def _new_folder(folder: str | Path | None) -> Path:
@@ -184,6 +187,11 @@ def _new_folder(folder: str | Path | None) -> Path:
     if (folder / "config.yaml").exists():
         raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
     return folder
+
+
+def _first(batch: Windows) -> Windows:
+    friction = None if batch.friction is None else batch.friction[:1]
+    return Windows(batch.velocity[:1], batch.force[:1], friction, batch.valid[:1])
 
 
 def _settings(model: Formulation, **arguments: Any) -> dict[str, Any]:

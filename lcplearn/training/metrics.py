@@ -4,12 +4,12 @@ import math
 import statistics
 import time
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lcplearn.datasets import BlockData, Recordings
 from lcplearn.formulations import Formulation
 from lcplearn.formulations.formulation import STICK_SPEED
 
@@ -49,18 +49,19 @@ UNITS = {
 }
 
 
-def truth(recordings: Any) -> Float[Tensor, "N T+1"]:
+def truth(recordings: Recordings) -> Float[Tensor, "N T+1"]:
     """Noise-free velocities where they are known, else the measured ones [m/s]."""
     return recordings.velocities if recordings.true_velocities is None else recordings.true_velocities
 
 
-def valid_steps(recordings: Any) -> Bool[Tensor, "N T"]:
+def valid_steps(recordings: Recordings) -> Bool[Tensor, "N T"]:
     """False after the end of a shorter recording."""
-    return torch.arange(recordings.forces.shape[1]) < recordings.steps[:, None]
+    steps = recordings.steps
+    return torch.arange(recordings.forces.shape[1], device=steps.device) < steps[:, None]
 
 
 @torch.no_grad()
-def one_step(model: Formulation, recordings: Any) -> dict[str, float | None]:
+def one_step(model: Formulation, recordings: Recordings) -> dict[str, float | None]:
     """Judge one step from every true state of the recordings.
 
     Stick figures need exact zeros in the truth, so real recordings have none.
@@ -85,7 +86,7 @@ def one_step(model: Formulation, recordings: Any) -> dict[str, float | None]:
 
 
 @torch.no_grad()
-def rollout(model: Formulation, recordings: Any, steps: int | None = None) -> tuple[Tensor, Tensor]:
+def rollout(model: Formulation, recordings: Recordings, steps: int | None = None) -> tuple[Tensor, Tensor]:
     """Predict recordings from their first true state and their forces.
 
     Returns:
@@ -98,7 +99,7 @@ def rollout(model: Formulation, recordings: Any, steps: int | None = None) -> tu
     return path.positions[..., 0], path.velocities[..., 0]
 
 
-def evaluate(model: Formulation, data: Any, *, train_seconds: float | None = None) -> dict[str, float | int | None]:
+def evaluate(model: Formulation, data: BlockData, *, train_seconds: float | None = None) -> dict[str, float | None]:
     """Evaluate a model on the test part of a data set.
 
     Args:
@@ -109,7 +110,7 @@ def evaluate(model: Formulation, data: Any, *, train_seconds: float | None = Non
     Returns:
         All `KEYS`; None where a figure does not apply or is not finite. `UNITS` says what each is.
     """
-    values: dict[str, float | int | None] = dict.fromkeys(KEYS)
+    values: dict[str, float | None] = dict.fromkeys(KEYS)
     values |= {key: value for key, value in one_step(model, data.test).items() if key in KEYS}
     learned = model.physical_parameters()
     values["mu"] = learned.get("mu")
@@ -127,25 +128,24 @@ def evaluate(model: Formulation, data: Any, *, train_seconds: float | None = Non
     return {key: _finite(value) for key, value in values.items()}
 
 
-def table(metrics: Mapping[str, float | int | None]) -> list[tuple[str, str, str]]:
+def table(metrics: Mapping[str, float | None]) -> list[tuple[str, str, str]]:
     """Rows (name, value, meaning) of the figures that apply."""
-    rows = [(key, number(metrics[key]), UNITS[key]) for key in KEYS if metrics[key] is not None]
-    return rows
+    return [(key, number(metrics[key]), UNITS[key]) for key in KEYS if metrics[key] is not None]
 
 
-def number(value: float | int | None) -> str:
+def number(value: float | None) -> str:
     """Four significant digits, as short as they go."""
     if value is None:
         return "-"
     return str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
-def format_table(metrics: Mapping[str, float | int | None]) -> str:
+def format_table(metrics: Mapping[str, float | None]) -> str:
     """The result table as text."""
     return "\n".join(f"{name:<22}{value:>12}   {unit}" for name, value, unit in table(metrics))
 
 
-def describe_model(model: Formulation, data: Any) -> str:
+def describe_model(model: Formulation, data: BlockData) -> str:
     """One line: what learns, how large it is, and from what."""
     parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
     dtype = str(next(model.parameters()).dtype).removeprefix("torch.")
@@ -153,7 +153,7 @@ def describe_model(model: Formulation, data: Any) -> str:
     return f"{type(model).__name__}: {parameters} parameters ({dtype}); {data.kind}: {steps} training steps"
 
 
-def _stops(model: Formulation, slides: Any) -> dict[str, float | None]:
+def _stops(model: Formulation, slides: Recordings) -> dict[str, float | None]:
     position, velocity = rollout(model, slides)
     rows, last = torch.arange(len(slides.steps)), slides.steps
     error = (position[rows, last] - slides.positions[rows, last]).abs() * 1e3
@@ -164,7 +164,7 @@ def _stops(model: Formulation, slides: Any) -> dict[str, float | None]:
     }
 
 
-def _rollout_rmse(model: Formulation, recordings: Any, steps: int) -> float | None:
+def _rollout_rmse(model: Formulation, recordings: Recordings | None, steps: int) -> float | None:
     if recordings is None or recordings.forces.shape[1] < steps:
         return None
     whole = recordings.steps >= steps
@@ -175,7 +175,7 @@ def _rollout_rmse(model: Formulation, recordings: Any, steps: int) -> float | No
 
 
 @torch.no_grad()
-def _predict_us(model: Formulation, recordings: Any, repeats: int = 200) -> float:
+def _predict_us(model: Formulation, recordings: Recordings, repeats: int = 200) -> float:
     velocity, force = truth(recordings)[:1, 0], recordings.forces[:1, 0]
     friction = None if recordings.friction is None else recordings.friction[:1, 0]
     seconds = []
@@ -190,9 +190,9 @@ def _rms(error: Tensor) -> float | None:
     return _finite(float(error.square().mean().sqrt()))
 
 
-def _share(flags: Bool[Tensor, "n"]) -> float | None:
+def _share(flags: Bool[Tensor, " n"]) -> float | None:
     return float(flags.double().mean()) if len(flags) else None
 
 
-def _finite(value: float | int | None) -> float | int | None:
+def _finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else value

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from lcplearn.formulations import Formulation, Windows, loss_terms
+from lcplearn.formulations.structured import FrictionLCP
 from lcplearn.training.checkpoint import describe
 from lcplearn.training.optimizer import Optimizer
-
 
 # torch's LBFGS learns curvature only from steps with y.s > 1e-10, an absolute number: losses of 1e-12 need enlarging.
 LBFGS_SCALE = 1e8
@@ -28,12 +28,20 @@ class FormulationModule(pl.LightningModule):
         loss: Weights of the loss terms.
         horizon: Steps of a training window.
         optimizer: Optimisers and their schedule.
+        log_every: Steps between two logs of the loss.
     """
 
-    def __init__(self, model: Formulation, *, loss: Mapping[str, float], horizon: int, optimizer: Optimizer) -> None:
+    model: Formulation
+    seconds_before: float
+    started: float
+
+    def __init__(
+        self, model: Formulation, *, loss: Mapping[str, float], horizon: int, optimizer: Optimizer, log_every: int = 1
+    ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.model, self.loss, self.optimizer, self.horizon = model, dict(loss), optimizer, horizon
+        self.log_every = log_every
         self.seconds_before, self.started = 0.0, time.perf_counter()
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
@@ -43,9 +51,8 @@ class FormulationModule(pl.LightningModule):
         self.started = time.perf_counter()
 
     def on_train_epoch_start(self) -> None:
-        loader = self.trainer.train_dataloader
-        if hasattr(loader, "set_epoch"):
-            loader.set_epoch(self.current_epoch)
+        if self.trainer.train_dataloader is not None:
+            self.trainer.train_dataloader.set_epoch(self.current_epoch)
         adam = self._optimizers()[0]
         for group in adam.param_groups:
             group["lr"] = self.optimizer.learning_rate(self.current_epoch, self.trainer.max_epochs or 1)
@@ -67,7 +74,7 @@ class FormulationModule(pl.LightningModule):
 
         active.step(closure=closure)
         # A scalar costs 0.5 ms to log: only those that are shown are.
-        if self.logger and self.global_step % self.trainer.log_every_n_steps == 0:
+        if self.logger and self.global_step % self.log_every == 0:
             scalars = {f"loss/{name}": float(value) for name, value in report.items()}
             scalars["optimizer/lr"] = float(active.param_groups[0]["lr"])
             self.logger.log_metrics(scalars, step=self.global_step)
@@ -92,7 +99,7 @@ class FormulationModule(pl.LightningModule):
 
     def _terms(self, windows: Windows) -> dict[str, Tensor]:
         temperature = self.optimizer.temperature(self.current_epoch)
-        if not temperature or not hasattr(self.model, "temperature"):
+        if not temperature or not isinstance(self.model, FrictionLCP):
             return loss_terms(self.model, windows, self.loss)
         self.model.temperature = temperature
         try:

@@ -13,7 +13,8 @@ from typing import Any
 
 import yaml
 
-LOSS_TERMS = ("prediction", "rollout", "complementarity", "nonnegativity", "violation")  # a test compares with losses.py
+# As in formulations/losses.py, which imports torch; a test compares them.
+LOSS_TERMS = ("prediction", "rollout", "complementarity", "nonnegativity", "violation")
 TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
 TYPES = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,), "None": (type(None),), "Path": (str,)}
 
@@ -139,9 +140,7 @@ def signature(target: str) -> dict[str, str] | None:
     if file is None:
         return None
     definitions = {
-        node.name: node
-        for node in ast.parse(file.read_text()).body
-        if isinstance(node, ast.ClassDef | ast.FunctionDef)
+        node.name: node for node in ast.parse(file.read_text()).body if isinstance(node, ast.ClassDef | ast.FunctionDef)
     }
     return _arguments(definitions, name)
 

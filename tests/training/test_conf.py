@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from training.helpers import ROOT
@@ -92,14 +93,14 @@ def test_a_mistake_gets_one_sentence_with_a_suggestion(overrides: str, message: 
 
 def test_a_missing_checkpoint_is_compared_with_those_that_are_there(tmp_path: Path) -> None:
     (tmp_path / "last.ckpt").touch()
-    with pytest.raises(checks.SettingsError, match="did you mean .*last.ckpt"):
+    with pytest.raises(checks.SettingsError, match=r"did you mean .*last\.ckpt"):
         checks.check(settings(f"ckpt_path={tmp_path / 'lst.ckpt'}"), TOP_LEVEL)
 
 
 def test_a_sweep_refuses_the_strategy_that_would_start_it_twice() -> None:
     chosen = settings("trainer.strategy=ddp")
     checks.check(chosen, TOP_LEVEL)
-    with pytest.raises(checks.SettingsError, match="use trainer.strategy=ddp_fork"):
+    with pytest.raises(checks.SettingsError, match=r"use trainer\.strategy=ddp_fork"):
         checks.check(chosen, TOP_LEVEL, multirun=True)
     checks.check(settings("trainer.strategy=ddp_fork"), TOP_LEVEL, multirun=True)
 
@@ -119,7 +120,7 @@ def test_a_sweep_refuses_the_strategy_that_would_start_it_twice() -> None:
     ],
 )
 def test_hydras_messages_become_sentences_with_a_suggestion(overrides: str, sentence: str) -> None:
-    with pytest.raises(Exception, match=".") as error:
+    with pytest.raises(HydraException) as error:
         settings(overrides)
     assert checks.explain(str(error.value), CONF) == sentence
 

@@ -140,7 +140,7 @@ def test_a_finished_or_foreign_checkpoint_is_refused_in_one_sentence(tmp_path: P
     last = tmp_path / "run" / "last.ckpt"
     cases = [
         (Physical(dt=data.dt), 2, "has finished its 2 epochs: set trainer.max_epochs above 2"),
-        (Physical(dt=data.dt, initial_mu=0.2), 4, "trained with model.initial_mu=its default, but the settings say 0.2"),
+        (Physical(dt=data.dt, initial_mu=0.2), 4, "with model.initial_mu=its default, but the settings say 0.2"),
         (MLP(dt=data.dt), 4, "Physical, but the settings ask for .*MLP"),
     ]
     for model, epochs, message in cases:

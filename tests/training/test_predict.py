@@ -63,7 +63,7 @@ def test_an_npz_batch_predicts_all_its_trajectories(checkpoint: Path, tmp_path: 
     with np.load(tmp_path / "out.npz") as found:
         assert np.array_equal(found["velocities"], expected.velocities[..., 0].detach().numpy())
         assert np.array_equal(found["mode"], expected.mode[..., 0].numpy())
-    with pytest.raises(SystemExit, match="one trajectory, not 2; write .npz instead"):
+    with pytest.raises(SystemExit, match=r"one trajectory, not 2; write \.npz instead"):
         predict.main([str(checkpoint), "--input", str(tmp_path / "in.npz"), "--output", str(tmp_path / "out.csv")])
 
 

@@ -26,10 +26,11 @@ def train(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
 def test_a_mistyped_setting_ends_in_one_sentence_without_torch(tmp_path: Path) -> None:
     code = "import runpy, sys; sys.argv = ['train.py', 'modle=relu']\ntry: runpy.run_path(%r, run_name='__main__')\n"
     code += "finally: print('torch' in sys.modules)"
-    script = code % str(ROOT / "train.py")
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    command = [sys.executable, "-c", code % str(ROOT / "train.py")]
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert done.stderr.strip() == "Unknown setting 'modle'; did you mean 'model'?"
+    assert done.stdout.strip() == "False"
     assert not (tmp_path / "runs").exists()
 
 
