@@ -26,10 +26,13 @@ def draw(model: Formulation, data: BlockData) -> dict[str, "Figure"]:
         data: `BlockData`.
 
     Returns:
-        Figures by name: one_step_map (models without measured friction, where a force acts), rollouts, error.
+        Figures by name: rollouts, error_over_horizon, and stops on slides, else one_step_map (for models that need no
+        measured friction).
     """
     pictures = {"rollouts": rollouts(model, data), "error_over_horizon": error_over_horizon(model, data)}
-    if not model.needs_friction:
+    if data.kind == "cube_slides":  # no force acts there
+        pictures["stops"] = stops(model, data)
+    elif not model.needs_friction:
         pictures["one_step_map"] = one_step_map(model, data)
     return pictures
 
@@ -75,10 +78,28 @@ def rollouts(model: Formulation, data: BlockData, count: int = 3) -> "Figure":
         ax.plot(time, _shown(velocity[row, : steps + 1], true[row]), label="rolled out from the start", **LEARNED)
         low, high = ax.get_ylim()
         ax.set(ylim=(low - 0.22 * (high - low), high), ylabel="velocity [m/s]")
-        _strip(ax, time, true[row, : steps + 1], 0.01, "black", f"{name} at rest", alpha=0.35)
+        if data.test.true_velocities is not None:  # a measured velocity is never exactly zero
+            _strip(ax, time, true[row, : steps + 1], 0.01, "black", "true at rest", alpha=0.35)
         _strip(ax, time, velocity[row, : steps + 1], 0.08, "tab:red", "predicted at rest")
     axes[-1][0].set_xlabel("time [s]")
     axes[0][0].legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    return figure
+
+
+def stops(model: Formulation, data: BlockData) -> "Figure":
+    """How far each slide goes: predicted from its start against recorded."""
+    figure, axes = _figure(1, 1, (5.2, 4.8))
+    test = data.test
+    position, _ = rollout(model, test)
+    rows = torch.arange(len(test.steps))
+    predicted, recorded = (1e3 * (x[rows, test.steps] - x[:, 0]) for x in (position, test.positions))
+    ax, reach = axes[0][0], float(recorded.max())
+    ax.plot([0.0, reach], [0.0, reach], color="0.6", linewidth=1.0)
+    ax.plot(recorded, predicted, ".", color=LEARNED["color"], alpha=0.6)
+    error = (predicted - recorded).abs().quantile(0.5)
+    ax.set(xlabel="recorded distance [mm]", ylabel="predicted distance [mm]", aspect="equal")
+    ax.set_title(f"{len(rows)} slides to rest: median error {error:.1f} mm", fontsize=11)
+    ax.grid(alpha=0.3)
     return figure
 
 

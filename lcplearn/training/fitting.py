@@ -12,6 +12,7 @@ from typing import Any
 import lightning.pytorch as pl
 import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.data import DataLoader
 
 from lcplearn.datasets import BlockData, WindowLoader, windows
@@ -184,7 +185,8 @@ def _log_results(
 
 def _new_folder(folder: str | Path | None) -> Path:
     folder = Path(folder) if folder is not None else Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
-    if (folder / "config.yaml").exists():
+    # The other processes of strategy=ddp start when the first has already written its settings there.
+    if rank_zero_only.rank == 0 and (folder / "config.yaml").exists():
         raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
     return folder
 
