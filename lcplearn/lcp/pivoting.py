@@ -390,10 +390,11 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
     z_size = 0.0
     for i in range(n):
         z_size = max(z_size, c[i] * z[i])
-    natural, q_size, rows, absMz, absq, total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    natural, noise, q_size, rows, absMz, absq, total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         f = d[i] / r[i]
         natural = max(natural, abs(min(c[i] * z[i] / d[i], w[i] * f)))
+        noise = max(noise, EPS * f * omega[i] if abs(w[i]) <= 8.0 * EPS * omega[i] else 0.0)
         q_size = max(q_size, f * abs(p[i]))
         z_share = c[i] * z[i] / z_size if z[i] > 0.0 else 0.0
         w_share = w[i] / omega[i] if w[i] != 0.0 else 0.0
@@ -402,6 +403,8 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
         absq = max(absq, abs(q[i]))
         total += abs(w[i]) + c[i] * s * z[i]
     residual = max(natural / q_size, rows)
+    if noise / q_size > 1e-6:  # w = 0 by luck, as for z = 1e18 (1, 1) and M = [[1, -1], [1, -1]], q = -1
+        residual = max(residual, noise / q_size)
     if not total <= _LARGEST:
         residual = np.inf
     return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))

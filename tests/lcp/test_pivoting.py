@@ -214,6 +214,10 @@ def test_feasible_problem_without_solution_is_unsolved():
     assert solve([[0, 1], [0, 1]], [-1, 0]).status[0] == Status.UNSOLVED
 
 
+def test_huge_z_whose_w_is_rounding_noise_is_not_solved():
+    assert solve([[2, -2], [1, -1]], [-2, -2]).status[0] != Status.SOLVED
+
+
 def test_solution_beyond_the_range_of_doubles_is_not_solved():
     result = solve([[1e-300]], [-1e100])
     assert result.status[0] != Status.SOLVED
