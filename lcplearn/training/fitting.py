@@ -186,7 +186,7 @@ def _log_results(
 def _new_folder(folder: str | Path | None) -> Path:
     folder = Path(folder) if folder is not None else Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     # The other processes of strategy=ddp start when the first has already written its settings there.
-    if rank_zero_only.rank == 0 and (folder / "config.yaml").exists():
+    if getattr(rank_zero_only, "rank", 0) == 0 and (folder / "config.yaml").exists():
         raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
     return folder
 
