@@ -42,7 +42,7 @@ def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool =
         raise SettingsError(f"threads must be at least 1, got {settings['threads']}.")
     _check_friction(settings)
     for group in ("data", "model", "optimizer", "logger"):
-        if settings.get(group) is not None:
+        if settings[group] or group != "logger":  # logger=none is empty
             _check_target(group, settings[group])
     _check_loss(settings["loss"])
     _check_arguments("trainer", settings["trainer"], TRAINER)

@@ -24,13 +24,12 @@ def names(group: str) -> list[str]:
 
 
 def settings(*overrides: str) -> dict[str, Any]:
-    """The resolved settings; hydra's own part, the run's folder, is made up."""
+    """The resolved settings; the run's folder, which only a run has, is made up."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("train", overrides=["++logger.save_dir=runs", *overrides])
+        folder = [] if "logger=none" in overrides else ["logger.save_dir=runs"]
+        config = compose("train", overrides=[*folder, *overrides])
     resolved = OmegaConf.to_container(config, resolve=True)
     assert isinstance(resolved, dict)
-    if resolved["logger"].keys() == {"save_dir"}:
-        resolved["logger"] = None
     return resolved
 
 
