@@ -16,8 +16,6 @@ from omegaconf.errors import OmegaConfBaseException
 DEBUGGING = os.environ.get("HYDRA_FULL_ERROR") == "1"
 MISTAKES = (HydraException, OmegaConfBaseException, ValueError, FileNotFoundError)
 CONF = Path(__file__).parent / "conf"
-TOP_LEVEL = ("seed", "threads", "batch_size", "patience", "ckpt_path", "data", "model", "loss", "optimizer", "trainer",
-             "logger")  # fmt: skip
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
@@ -37,7 +35,7 @@ def train(config: DictConfig) -> float:
 
     run = HydraConfig.get()
     settings = OmegaConf.to_container(config, resolve=True)
-    check(settings, TOP_LEVEL, multirun=run.mode.name == "MULTIRUN")
+    check(settings, CONF, multirun=run.mode.name == "MULTIRUN")
 
     import torch
     from lightning import seed_everything

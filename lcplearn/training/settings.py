@@ -23,19 +23,19 @@ class SettingsError(ValueError):
     """A mistake in the settings; the message is one sentence for the person who wrote them."""
 
 
-def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool = False) -> None:
+def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) -> None:
     """Refuse settings that can't be what was meant.
 
     Args:
         settings: The resolved settings of a run.
-        known: Names that may stand at the top level.
+        conf: Folder of the configuration, whose train.yaml and folders name what may stand at the top level.
         multirun: True in a sweep.
 
     Raises:
         SettingsError: the first mistake found.
     """
     for key in settings:
-        _known(key, known, "setting")
+        _known(key, _vocabulary(conf, "")[0], "setting")
     for key, kind in (("seed", "int"), ("threads", "int"), ("batch_size", "int | None"), ("patience", "int | None")):
         _check_type(key, settings.get(key), kind)
     if settings["threads"] < 1:
@@ -44,8 +44,13 @@ def check(settings: Mapping[str, Any], known: Iterable[str], *, multirun: bool =
     for group in ("data", "model", "optimizer", "logger"):
         if settings[group] or group != "logger":  # logger=none is empty
             _check_target(group, settings[group])
+    if settings["batch_size"] is not None and settings["optimizer"].get("lbfgs_after") is not None:
+        raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
     _check_loss(settings["loss"])
     _check_arguments("trainer", settings["trainer"], TRAINER)
+    epochs = settings["trainer"]["max_epochs"]
+    if epochs is None or epochs < 1:
+        raise SettingsError(f"trainer.max_epochs must be at least 1, got {epochs}.")
     strategy = str(settings["trainer"].get("strategy", "auto"))
     if multirun and strategy.startswith("ddp") and not strategy.startswith(("ddp_fork", "ddp_spawn")):
         raise SettingsError(f"A sweep (-m) can't run with trainer.strategy={strategy}: use trainer.strategy=ddp_fork.")
