@@ -42,7 +42,10 @@ STYLES: dict[str, Style] = {
     "psd_skew": Style(YELLOW, "p", "-."),
     "structured": Style(GREEN, "^"),
     "physical": Style(GREEN, "*", "--"),
-    "markov_chain": Style("#888888", "d", "-"),
+    "markov": Style("#888888", "d", "-"),
+    # rows of a scene's LCP
+    "full": Style(RED, "s"),
+    "minimal": Style(BLUE, "o"),
     "truth": Style(BLACK, "", "-"),
 }
 

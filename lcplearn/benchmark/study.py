@@ -100,13 +100,13 @@ class Study:
         yield from tqdm(todo, unit="key", disable=None, smoothing=0.1)
 
     def add(self, key: Sequence[Value], *rows: Mapping[str, Value]) -> None:
-        """Keep the rows of a key (at least one), on disk before this returns.
+        """Keep the rows of a key (at least one), on disk before this returns; a column left out is empty.
 
         Raises:
-            ValueError: A row has other columns than the study.
+            ValueError: A row has a column that the study has not.
         """
         names = dict(zip(self.key, key, strict=True))
-        full = [{**names, **row} for row in rows]
+        full = [{**dict.fromkeys(self.columns, ""), **names, **row} for row in rows]
         for row in full:
             if set(row) != set(self.columns):
                 raise ValueError(f"a row of {self.name} must have {list(self.columns)}; got {list(row)}")
