@@ -777,9 +777,7 @@ def _solve_one(
             if stage == 4:
                 for i in range(n):
                     basis[i] = p[i] < 0.0
-            ended, count = _block_pivoting(
-                S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left)
-            )
+            ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left))
         elif stage < 6:
             pivot = _prepare_lemke(stage, single_precision, cover)
             cap = left if budget >= 0 else 10 * n + 50
