@@ -4,7 +4,8 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import lightning.pytorch as pl
 import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.utils.data import DataLoader
 
 from lcplearn.datasets import BlockData, WindowLoader, windows
@@ -113,9 +115,10 @@ def fit(
         callbacks.append(EpochBar())
     if patience is not None:
         callbacks.append(EarlyStop("val/loss", patience=patience))
-    lightning_trainer = pl.Trainer(
-        default_root_dir=folder, callbacks=callbacks, logger=logger or False, num_sanity_val_steps=0, **chosen
-    )
+    with _trainer_errors():
+        lightning_trainer = pl.Trainer(
+            default_root_dir=folder, callbacks=callbacks, logger=logger or False, num_sanity_val_steps=0, **chosen
+        )
     module = FormulationModule(
         model, loss=loss, horizon=horizon, optimizer=optimizer, log_every=every * (len(loader) if batch_size else 1)
     )
@@ -125,7 +128,8 @@ def fit(
         (folder / "config.yaml").write_text(yaml.safe_dump(dict(settings), sort_keys=False))
     start = time.perf_counter()
     validation_loader = DataLoader([validation], batch_size=None)  # type: ignore[arg-type, var-annotated]  # one batch
-    lightning_trainer.fit(module, loader, validation_loader, ckpt_path=ckpt_path, weights_only=True)
+    with _trainer_errors():
+        lightning_trainer.fit(module, loader, validation_loader, ckpt_path=ckpt_path, weights_only=True)
     if last.stopped:
         raise TrainingInterrupted(last.path)
     return _finish(lightning_trainer, module, best, data, folder, seconds_before + time.perf_counter() - start)
@@ -189,6 +193,15 @@ def _new_folder(folder: str | Path | None) -> Path:
     if getattr(rank_zero_only, "rank", 0) == 0 and (folder / "config.yaml").exists():
         raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
     return folder
+
+
+@contextmanager
+def _trainer_errors() -> Iterator[None]:
+    """Settings that Lightning refuses, such as a device that isn't there, are the caller's mistake."""
+    try:
+        yield
+    except MisconfigurationException as error:
+        raise ValueError(f"Lightning's Trainer can't use these settings: {' '.join(str(error).split())}") from error
 
 
 def _first(batch: Windows) -> Windows:

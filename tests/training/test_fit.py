@@ -155,6 +155,13 @@ def test_a_loss_that_the_model_does_not_have_is_refused_before_training(tmp_path
     assert not (tmp_path / "run").exists()
 
 
+def test_a_device_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
+    data = tiny_data()
+    with pytest.raises(ValueError, match="Lightning's Trainer can't use these settings") as error:
+        short_fit(Physical(dt=data.dt), data, tmp_path / "run", trainer=QUIET | {"devices": 0})
+    assert "\n" not in str(error.value)
+
+
 def test_annealing_leaves_the_plateau_where_no_sample_slips(tmp_path: Path) -> None:
     data = tiny_data(length=5, initial_speed=0.0, trajectories=20)
     errors = {}
