@@ -64,8 +64,8 @@ def read(path: str | Path, map_location: str | torch.device | None = None) -> di
     return checkpoint
 
 
-def check_resumable(path: str | Path, model: Formulation, max_epochs: int) -> None:
-    """Refuse a checkpoint of another model, or one with nothing left to train.
+def check_resumable(path: str | Path, model: Formulation, objective: dict[str, Any], max_epochs: int) -> None:
+    """Refuse a checkpoint of another model or loss, or one with nothing left to train.
 
     Raises:
         ValueError: one sentence that names the first difference.
@@ -78,6 +78,9 @@ def check_resumable(path: str | Path, model: Formulation, max_epochs: int) -> No
         before, now = saved["arguments"].get(name, "its default"), ours["arguments"].get(name, "its default")
         if before != now:
             raise ValueError(f"{path} was trained with model.{name}={before}, but the settings say {now}.")
+    for name, before in checkpoint["objective"].items():
+        if before != objective[name]:
+            raise ValueError(f"{path} was trained with {name} {before}, but the settings say {objective[name]}.")
     # Lightning counts the epoch that is under way; a checkpoint is written at its end.
     done = checkpoint["epoch"] + 1
     if done >= max_epochs:

@@ -101,10 +101,6 @@ def fit(
     _quiet()
     batches, validation = windows(data.train, horizon), windows(data.validation, horizon)
     loss_terms(model, _first(batches), loss)  # refuses what doesn't fit before anything is written
-    seconds_before = 0.0
-    if ckpt_path is not None:
-        check_resumable(ckpt_path, model, epochs)
-        seconds_before = read(ckpt_path)["train_seconds"]
     loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
     chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
     every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
@@ -122,6 +118,10 @@ def fit(
     module = FormulationModule(
         model, loss=loss, horizon=horizon, optimizer=optimizer, log_every=every * (len(loader) if batch_size else 1)
     )
+    seconds_before = 0.0
+    if ckpt_path is not None:
+        check_resumable(ckpt_path, model, module.objective, epochs)
+        seconds_before = read(ckpt_path)["train_seconds"]
     if lightning_trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
         settings = settings or _settings(model, loss=loss, horizon=horizon, seed=seed, epochs=epochs)
@@ -144,11 +144,12 @@ def _finish(
     seconds: float,
 ) -> Result:
     """Take the best parameters, judge them and write what a run leaves; only the first process writes."""
-    validation = float(best.best_model_score) if best.best_model_score is not None else float("nan")
-    model = module.model.cpu().eval()
+    model, validation = module.model.cpu().eval(), float("nan")
     if best.best_model_path:
-        state = read(best.best_model_path, "cpu")["state_dict"]
-        module.load_state_dict(state)
+        # From the file and not from the callback: that one stayed in another process with strategy=ddp_fork.
+        checkpoint = read(best.best_model_path, "cpu")
+        module.load_state_dict(checkpoint["state_dict"])
+        validation = float(checkpoint["callbacks"][best.state_key]["best_model_score"])
     if not trainer.is_global_zero:
         return Result(model, None, validation, folder)
     metrics = evaluate(model, data, train_seconds=seconds)

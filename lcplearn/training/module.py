@@ -86,11 +86,16 @@ class FormulationModule(pl.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["formulation"] = describe(self.model)
-        checkpoint["training"] = {"loss": self.loss, "horizon": self.horizon}
+        checkpoint["objective"] = self.objective
         checkpoint["train_seconds"] = self.seconds
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.seconds_before = checkpoint["train_seconds"]
+
+    @property
+    def objective(self) -> dict[str, Any]:
+        """What is minimised, as plain values."""
+        return {"loss": {name: weight for name, weight in self.loss.items() if weight}, "horizon": self.horizon}
 
     @property
     def seconds(self) -> float:

@@ -146,6 +146,8 @@ def test_a_finished_or_foreign_checkpoint_is_refused_in_one_sentence(tmp_path: P
     for model, epochs, message in cases:
         with pytest.raises(ValueError, match=message):
             short_fit(model, data, tmp_path / "again", epochs=epochs, ckpt_path=last)
+    with pytest.raises(ValueError, match=r"was trained with loss .*prediction.*, but the settings say .*rollout"):
+        short_fit(Physical(dt=data.dt), data, tmp_path / "again", ckpt_path=last, loss={"rollout": 1.0})
 
 
 def test_a_loss_that_the_model_does_not_have_is_refused_before_training(tmp_path: Path) -> None:

@@ -8,8 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import yaml
-from training.helpers import ROOT
+from training.helpers import ROOT, short_fit
+
+from lcplearn.datasets import simulate_sliding_block
+from lcplearn.formulations import Physical
+from lcplearn.training import Optimizer
 
 SMALL = ["data.trajectories=4", "data.length=30", "+data.long_length=20", "trainer.check_val_every_n_epoch=1"]
 
@@ -34,7 +39,7 @@ def test_a_mistyped_setting_ends_in_one_sentence_without_torch(tmp_path: Path) -
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_sweep_over_two_processes_each_ends_with_the_comparison(tmp_path: Path) -> None:
+def test_a_sweep_over_two_processes_each_trains_as_one_would_and_ends_with_the_comparison(tmp_path: Path) -> None:
     done = train(tmp_path, "-m", "model=affine,physical", "trainer.max_epochs=3", "optimizer.lbfgs_after=2",
                  "trainer.strategy=ddp_fork", "trainer.devices=2", *SMALL)  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -45,6 +50,11 @@ def test_a_sweep_over_two_processes_each_ends_with_the_comparison(tmp_path: Path
         config = yaml.safe_load((folder / str(number) / "config.yaml").read_text())
         assert config["model"]["_target_"].endswith(model)
         assert model in (folder / "compare.md").read_text()
+    data = simulate_sliding_block(trajectories=4, length=30, long_length=20)
+    alone = short_fit(Physical(dt=data.dt), data, tmp_path / "alone", epochs=3, optimizer=Optimizer(lbfgs_after=2))
+    together = json.loads((folder / "1" / "metrics.json").read_text())
+    assert alone.metrics is not None
+    assert together["velocity_rmse"] == pytest.approx(alone.metrics["velocity_rmse"], rel=1e-6)
     noise = [line for line in done.stderr.splitlines() if line and "epoch" not in line]
     assert not noise, noise  # no adverts and no warnings
 
