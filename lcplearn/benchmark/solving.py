@@ -1,0 +1,131 @@
+"""Every method and installed peer behind one call, judged by one judge."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from lcplearn.benchmark.methods import peers
+from lcplearn.lcp.residuals import default_tolerance, judge
+from lcplearn.lcp.solution import Status
+from lcplearn.lcp.solve import solve_lcp
+
+OURS: dict[str, tuple[Any, torch.dtype]] = {
+    "pivoting": ("pivoting", torch.float64),
+    "interior_point": ("interior_point", torch.float64),
+    "diagonal": ("diagonal", torch.float64),
+    "pivoting float32": ("pivoting", torch.float32),
+    "interior_point float32": ("interior_point", torch.float32),
+}
+
+
+class Answer(NamedTuple):
+    """What a method returned for B problems.
+
+    Attributes:
+        z: [B, n], float64.
+        statuses: Names of `Status` values, of which a peer knows SOLVED and UNSOLVED.
+        residual, tolerance: Ours, recomputed from z as it came back, and what it is held against: [B].
+    """
+
+    z: np.ndarray
+    statuses: list[str]
+    residual: np.ndarray
+    tolerance: np.ndarray
+
+
+METHODS: tuple[str, ...] = (*OURS, *peers())
+
+
+def solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
+    """Solve B problems M [B, n, n], q [B, n] by one of `METHODS`; None if it doesn't apply."""
+    if method in peers():
+        if q.shape[1] == 0:
+            return None
+        found = peers()[method](M, q)
+        return _judged(M, q, found.z, ["SOLVED" if claim else "UNSOLVED" for claim in found.claimed], torch.float64)
+    name, dtype = OURS[method]
+    if name == "diagonal" and np.where(np.eye(M.shape[-1]) == 1, 0, M).any():
+        return None
+    with np.errstate(over="ignore"):
+        data = [torch.from_numpy(np.ascontiguousarray(x)).to(dtype) for x in (M, q)]
+    solution = solve_lcp(*data, method=name)
+    statuses = [Status(value).name for value in solution.status.tolist()]
+    M, q, z = (x.double().numpy() for x in (*data, solution.z))
+    return _judged(M, q, z, statuses, dtype)
+
+
+def _judged(M: np.ndarray, q: np.ndarray, z: np.ndarray, statuses: list[str], dtype: torch.dtype) -> Answer:
+    tensors = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M, q, z))
+    residual, tolerance = (x.numpy() for x in judge(*tensors, tol=default_tolerance(dtype)))
+    if dtype == torch.float32 and q.shape[-1]:
+        # what rounding of z to the caller's float32 costs, however well it was solved
+        with np.errstate(invalid="ignore"):
+            size = (np.abs(M) @ np.abs(z)[..., None])[..., 0].max(-1) / np.maximum(np.abs(q).max(-1), 1e-300)
+            tolerance = np.maximum(tolerance, 10 * np.finfo(np.float32).eps * size)
+    return Answer(z, statuses, residual, tolerance)
+
+
+def gradient_error(method: str, M: np.ndarray, q: np.ndarray, read: np.ndarray | None, symmetric: bool) -> float:
+    """Relative error of a directional derivative against one-sided finite differences, whichever side is nearer.
+
+    Of what is unique: read @ z, or w where M is symmetric and positive semidefinite. The direction keeps what is
+    unique so: M (1 + t s) with q + t read' r, or, where all of z or w is, with q + t (M (z r) + w r').
+
+    Args:
+        method: A method of ours, else NaN.
+        M, q: One problem, [n, n] and [n].
+        read: What is unique, [k, n], or None.
+        symmetric: Whether M is symmetric and positive semidefinite.
+
+    Returns:
+        The error over the larger derivative. NaN if nothing is unique, or if neither side has a derivative that two
+        step sizes agree about.
+    """
+    if method not in OURS or len(q) == 0 or (read is None and not symmetric):
+        return float("nan")
+    name, dtype = OURS[method]
+    start = solve_lcp(torch.from_numpy(np.array(M)), torch.from_numpy(np.array(q)), method=name)
+    z, w = start.z.numpy(), start.w.numpy()
+    rng = np.random.default_rng(0)
+    s = float(rng.standard_normal())
+    if read is None or np.count_nonzero(read) == len(q) == len(read):
+        dq = M @ (z * rng.standard_normal(len(q))) + w * rng.standard_normal(len(q))
+    else:
+        dq = read.T @ rng.standard_normal(len(read))
+        dq *= np.abs(q).max() / np.abs(dq).max()
+    unique = w if read is None else read @ z
+    sizes = np.where(unique == 0, max(np.abs(unique).max(), 1e-300), np.abs(unique))
+    readout = torch.from_numpy(rng.standard_normal(len(unique)) / sizes)
+
+    def value(M: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        solution = solve_lcp(M, q, method=name)
+        if read is None:
+            return readout @ solution.w.double()
+        return readout @ (torch.from_numpy(read) @ solution.z.double())
+
+    # our derivative in the method's dtype; differences always in float64, for float32 can't resolve them
+    tensors = [torch.from_numpy(np.array(array)).to(dtype).requires_grad_() for array in (M, q)]
+    gradients = torch.autograd.grad(value(*tensors), tensors, allow_unused=True)
+    direction = (s * M, dq)
+    ours = sum(
+        float((g.double() * torch.from_numpy(d)).sum())
+        for g, d in zip(gradients, direction, strict=True)
+        if g is not None
+    )
+
+    def at(t: float) -> float:
+        with torch.no_grad():
+            return float(value(torch.from_numpy(M + t * direction[0]), torch.from_numpy(q + t * direction[1])))
+
+    sides = [d for d in (_one_sided(at, 1.0), _one_sided(at, -1.0)) if d is not None]
+    if not sides or not np.isfinite(ours):
+        return float("nan")
+    return min(abs(ours - d) / max(abs(ours), abs(d), 1e-3) for d in sides)
+
+
+def _one_sided(at: Callable[[float], float], sign: float) -> float | None:
+    """Derivative towards one side; None if two step sizes disagree."""
+    fine, coarse = ((at(sign * h) - at(0.0)) / (sign * h) for h in (1e-6, 1e-5))
+    return fine if abs(fine - coarse) <= 1e-3 * max(abs(fine), abs(coarse), 1e-3) else None
