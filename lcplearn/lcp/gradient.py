@@ -18,85 +18,172 @@ least-squares solution of smallest norm in equilibrated coordinates: exact for l
 velocities, and a bounded choice for what is not, such as the split of redundant forces.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
+from lcplearn.lcp.methods import Options, as_array, as_tensor, pivoting_kernel, pivots, solve
 from lcplearn.lcp.residuals import two_sided_scales
 from lcplearn.lcp.solution import LCPSolution, Status
-
-ForwardSolve = Callable[[Tensor, Tensor, Tensor | None], LCPSolution]
 
 # By precision of the data: pivots below the first (times n) call a block singular, singular values below the second
 # are dropped. Rank-deficient contact matrices rounded to float32 are full rank at 1e-7 only by rounding.
 RANK_TOLERANCES = {torch.float64: (1e-15, 1e-9), torch.float32: (1e-7, 1e-5)}
 
 
-class DifferentiableSolve(torch.autograd.Function):
-    """Run `solve(M, q, initial_basis)` and give z and w of its solution their implicit derivative.
+def differentiable_solve(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:
+    """Solve, and give z and w of the solution their implicit derivative.
 
     M is [*batch, n, n], or [n, n] shared by the batch of q [*batch, n]; its gradient is then the sum over the batch.
     """
+    if torch._C._are_functorch_transforms_active():
+        return LCPSolution(*_TransformableSolve.apply(M, q, initial_basis, options))
+    z, w, solution = _EagerSolve.apply(M, q, initial_basis, options)
+    return LCPSolution(z, w, *solution[2:])
+
+
+class _EagerSolve(torch.autograd.Function):
+    """Derivatives outside torch.func. Without `setup_context`, whose dispatch takes longer than a small solve."""
 
     @staticmethod
-    def forward(M: Tensor, q: Tensor, initial_basis: Tensor | None, solve: ForwardSolve, smoothed: bool) -> Any:
-        return tuple(solve(M, q, initial_basis))
+    def forward(ctx: Any, M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> Any:
+        solution = solve(M, q, initial_basis, options)
+        _save(ctx, M, solution, options)
+        return solution.z, solution.w, solution
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        M, _, _, _, ctx.smoothed = inputs
-        z, w, basis, status, *_ = output
-        ctx.mark_non_differentiable(*output[2:])
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(M, z, w, basis, status)
-        ctx.save_for_forward(M, z, w, basis, status)
-
-    @staticmethod
-    def backward(ctx: Any, grad_z: Tensor | None, grad_w: Tensor | None, *_: Any) -> Any:
-        M, z, w, basis, status = ctx.saved_tensors
-        if (grad_z is None and grad_w is None) or not any(ctx.needs_input_grad[:2]):
-            return None, None, None, None, None
-        solved = (status == Status.SOLVED).unsqueeze(-1)
-        g_z = torch.zeros_like(z) if grad_z is None else torch.where(solved, grad_z, 0.0)
-        g_w = torch.zeros_like(w) if grad_w is None else torch.where(solved, grad_w, 0.0)
-        z = torch.where(solved, z, 0.0)
-        h_I = torch.where(basis, 0.0, g_w)
-        rhs = -g_z - (M.mT @ h_I.unsqueeze(-1)).squeeze(-1)
-        K = M.mT
-        if ctx.smoothed:
-            damping = _damping(z, w, solved)
-            K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
-        grad_q = torch.where(basis, basis_solve(K, basis & solved, rhs), h_I)
-        grad_M = (grad_q.unsqueeze(-1) * z.unsqueeze(-2)).sum_to_size(M.shape) if ctx.needs_input_grad[0] else None
-        return grad_M, grad_q if ctx.needs_input_grad[1] else None, None, None, None
+    def backward(ctx: Any, grad_z: Tensor | None, grad_w: Tensor | None, _: Any) -> Any:
+        if grad_z is None and grad_w is None:
+            return None, None, None, None
+        need_M, need_q, *_ = ctx.needs_input_grad
+        grad_M, grad_q = adjoint(ctx.saved_tensors, grad_z, grad_w, need_M, ctx.options)
+        return grad_M, grad_q if need_q else None, None, None
 
     @staticmethod
     def jvp(ctx: Any, dM: Tensor | None, dq: Tensor | None, *_: Any) -> Any:
-        M, z, w, basis, status = ctx.saved_tensors
-        solved = (status == Status.SOLVED).unsqueeze(-1)
-        z = torch.where(solved, z, 0.0)
-        e = torch.zeros_like(z) if dq is None else torch.where(solved, dq, 0.0)
-        if dM is not None:
-            e = e + torch.where(solved, (dM @ z.unsqueeze(-1)).squeeze(-1), 0.0)
-        K = M + torch.diag_embed(_damping(z, w, solved)) if ctx.smoothed else M
-        dz = basis_solve(K, basis & solved, -e)
-        dw = e + (M @ dz.unsqueeze(-1)).squeeze(-1)
-        if not ctx.smoothed:
-            dw = torch.where(basis, 0.0, dw)
-        return dz, torch.where(solved, dw, 0.0), None, None, None, None, None
+        return *tangent(ctx.saved_tensors, dM, dq, ctx.options), None
+
+
+class _TransformableSolve(torch.autograd.Function):
+    """The same for torch.func: grad, jacrev, vmap, jvp and their compositions."""
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, M: Tensor, q: Tensor, initial_basis: Tensor | None, solve: Any, smoothed: bool) -> Any:
-        if in_dims[0] is not None or M.dim() > 2:
-            M = _batch_first(M, in_dims[0], info.batch_size)
-        q = _batch_first(q, in_dims[1], info.batch_size)
-        if M.dim() == 3 and q.dim() > 2:  # one shared matrix for each element that vmap sees
-            M = M.reshape(info.batch_size, *(1,) * (q.dim() - 2), *M.shape[1:]).expand(*q.shape, q.shape[-1])
-        if initial_basis is not None:
-            initial_basis = _batch_first(initial_basis, in_dims[2], info.batch_size)
-        return DifferentiableSolve.apply(M, q, initial_basis, solve, smoothed), (0,) * len(LCPSolution._fields)
+    def forward(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> Any:
+        return tuple(solve(M, q, initial_basis, options))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        M, _, _, options = inputs
+        ctx.mark_non_differentiable(*output[2:])
+        _save(ctx, M, LCPSolution(*output), options)
+
+    @staticmethod
+    def backward(ctx: Any, grad_z: Tensor | None, grad_w: Tensor | None, *_: Any) -> Any:
+        return _EagerSolve.backward(ctx, grad_z, grad_w, None)
+
+    @staticmethod
+    def jvp(ctx: Any, dM: Tensor | None, dq: Tensor | None, *_: Any) -> Any:
+        return *tangent(ctx.saved_tensors, dM, dq, ctx.options), *(None,) * (len(LCPSolution._fields) - 2)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *inputs: Any) -> Any:
+        batched = batch_inputs(info.batch_size, in_dims[:3], *inputs[:3])
+        return _TransformableSolve.apply(*batched, inputs[3]), (0,) * len(LCPSolution._fields)
+
+
+def _save(ctx: Any, M: Tensor, solution: LCPSolution, options: Options) -> None:
+    ctx.options = options
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(M, *solution[:4])
+    ctx.save_for_forward(M, *solution[:4])
+
+
+def batch_inputs(
+    size: int, in_dims: tuple[int | None, ...], M: Tensor, q: Tensor, initial_basis: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The inputs of a solve mapped over `in_dims`, as one larger batch; a matrix that nothing maps stays shared."""
+    if in_dims[0] is not None or M.dim() > 2:
+        M = _batch_first(M, in_dims[0], size)
+    q = _batch_first(q, in_dims[1], size)
+    if M.dim() == 3 and q.dim() > 2:  # one shared matrix for each element that vmap sees
+        M = M.reshape(size, *(1,) * (q.dim() - 2), *M.shape[1:]).expand(*q.shape, q.shape[-1])
+    if initial_basis is not None:
+        initial_basis = _batch_first(initial_basis, in_dims[2], size)
+    return M, q, initial_basis
+
+
+def adjoint(
+    saved: tuple[Tensor, ...], grad_z: Tensor | None, grad_w: Tensor | None, need_M: bool, options: Options
+) -> tuple[Tensor | None, Tensor]:
+    """Gradients with respect to M (or None) and q from those with respect to z and w (None is zero).
+
+    `saved` holds M, z, w, basis and status.
+    """
+    M, z, w, basis, status = saved
+    grad_z = torch.zeros_like(z) if grad_z is None else grad_z
+    grad_w = torch.zeros_like(w) if grad_w is None else grad_w
+    scales = hasattr(pivoting_kernel(), "_equilibrate_rows_and_columns")  # TEMPORARY until pivoting.py is patched
+    if scales and pivots(z, options) and not _differentiated(z, grad_z, grad_w):
+        return _adjoint_in_kernel(M, z, basis, status, grad_z, grad_w, need_M)
+    dtype = z.dtype
+    M, z, w, grad_z, grad_w = (x.double() for x in (M, z, w, grad_z, grad_w))
+    solved = (status == Status.SOLVED).unsqueeze(-1)
+    g_z, g_w, z = (torch.where(solved, x, 0.0) for x in (grad_z, grad_w, z))
+    h_I = torch.where(basis, 0.0, g_w)
+    rhs = -g_z - (M.mT @ h_I.unsqueeze(-1)).squeeze(-1)
+    K = M.mT
+    if options.smoothing:
+        damping = _damping(z, w, solved)
+        K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
+    grad_q = torch.where(basis, _solve_on_basis(K, basis & solved, rhs, dtype, options), h_I)
+    grad_M = (grad_q.unsqueeze(-1) * z.unsqueeze(-2)).sum_to_size(M.shape).to(dtype) if need_M else None
+    return grad_M, grad_q.to(dtype)
+
+
+def _differentiated(*tensors: Tensor) -> bool:
+    """Whether somebody wants a derivative of the backward, or maps it: then it has to be made of torch's operations."""
+    if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
+        return True
+    return any(unpack_dual(x).tangent is not None or torch._C._functorch.is_legacy_batchedtensor(x) for x in tensors)
+
+
+def _adjoint_in_kernel(
+    M: Tensor, z: Tensor, basis: Tensor, status: Tensor, grad_z: Tensor, grad_w: Tensor, need_M: bool
+) -> tuple[Tensor | None, Tensor]:
+    kernel: Any = pivoting_kernel()
+    n = z.shape[-1]
+    count = status.numel()
+    grad_M, grad_q = kernel.solve_adjoint(
+        as_array(M, 1 if M.dim() == 2 else count, n, n),
+        as_array(z, count, n),
+        basis.numpy().reshape(count, n),
+        as_array(grad_z, count, n),
+        as_array(grad_w, count, n),
+        status.numpy().reshape(count) == 0,  # SOLVED; comparison with the enum itself takes longer than the solve
+        need_M,
+        single_precision=z.dtype is torch.float32,
+    )
+    return as_tensor(grad_M, M) if need_M else None, as_tensor(grad_q, z)
+
+
+def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, options: Options) -> tuple[Tensor, Tensor]:
+    """Directional derivatives of z and w along dM and dq (None is zero)."""
+    M, z, w, basis, status = saved
+    dtype = z.dtype
+    M, z, w = M.double(), z.double(), w.double()
+    solved = (status == Status.SOLVED).unsqueeze(-1)
+    z = torch.where(solved, z, 0.0)
+    e = torch.zeros_like(z) if dq is None else torch.where(solved, dq.double(), 0.0)
+    if dM is not None:
+        e = e + torch.where(solved, (dM.double() @ z.unsqueeze(-1)).squeeze(-1), 0.0)
+    K = M + torch.diag_embed(_damping(z, w, solved)) if options.smoothing else M
+    dz = _solve_on_basis(K, basis & solved, -e, dtype, options)
+    dw = e + (M @ dz.unsqueeze(-1)).squeeze(-1)
+    if not options.smoothing:
+        dw = torch.where(basis, 0.0, dw)
+    return dz.to(dtype), torch.where(solved, dw, 0.0).to(dtype)
 
 
 def _damping(z: Tensor, w: Tensor, solved: Tensor) -> Tensor:
@@ -104,41 +191,45 @@ def _damping(z: Tensor, w: Tensor, solved: Tensor) -> Tensor:
     return torch.where(solved, w, 0.0) / torch.where(solved, z, 1.0)
 
 
-def basis_solve(K: Tensor, basis: Tensor, rhs: Tensor) -> Tensor:
+def _solve_on_basis(K: Tensor, basis: Tensor, rhs: Tensor, dtype: torch.dtype, options: Options) -> Tensor:
     """x with K_AA x_A = rhs_A and x = 0 off the basis A; smallest least-squares solution where K_AA is singular."""
-    return _BasisSolve.apply(K, basis, rhs)
+    if options.method == "diagonal":
+        return torch.where(basis, rhs / torch.where(basis, K.diagonal(dim1=-2, dim2=-1), 1.0), 0.0)
+    return _BasisSolve.apply(K, basis, rhs, RANK_TOLERANCES[dtype])
 
 
 class _BasisSolve(torch.autograd.Function):
     """Its derivative is the same solve: dx = K_AA^-1 (drhs - dK x), so that second derivatives come for free."""
 
     @staticmethod
-    def forward(K: Tensor, basis: Tensor, rhs: Tensor) -> Tensor:
-        return _solve_block(K.double(), basis, rhs.double(), *RANK_TOLERANCES[K.dtype]).to(rhs.dtype)
+    def forward(K: Tensor, basis: Tensor, rhs: Tensor, rank_tolerances: tuple[float, float]) -> Tensor:
+        return _solve_block(K, basis, rhs, *rank_tolerances)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        ctx.save_for_backward(inputs[0], inputs[1], output)
-        ctx.save_for_forward(inputs[0], inputs[1], output)
+        K, basis, _, ctx.rank_tolerances = inputs
+        ctx.save_for_backward(K, basis, output)
+        ctx.save_for_forward(K, basis, output)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
         K, basis, x = ctx.saved_tensors
-        y = basis_solve(K.mT, basis, grad)
+        y = _BasisSolve.apply(K.mT, basis, grad, ctx.rank_tolerances)
         grad_K = (-y.unsqueeze(-1) * x.unsqueeze(-2)).sum_to_size(K.shape) if ctx.needs_input_grad[0] else None
-        return grad_K, None, y
+        return grad_K, None, y, None
 
     @staticmethod
-    def jvp(ctx: Any, dK: Tensor | None, _: Any, drhs: Tensor | None) -> Tensor:
+    def jvp(ctx: Any, dK: Tensor | None, _: Any, drhs: Tensor | None, *__: Any) -> Tensor:
         K, basis, x = ctx.saved_tensors
         e = torch.zeros_like(x) if drhs is None else drhs
-        return basis_solve(K, basis, e if dK is None else e - (dK @ x.unsqueeze(-1)).squeeze(-1))
+        e = e if dK is None else e - (dK @ x.unsqueeze(-1)).squeeze(-1)
+        return _BasisSolve.apply(K, basis, e, ctx.rank_tolerances)
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, *tensors: Tensor) -> Any:
-        K, basis, rhs = (_batch_first(x, dim, info.batch_size) for x, dim in zip(tensors, in_dims, strict=True))
+    def vmap(info: Any, in_dims: Any, *inputs: Any) -> Any:
+        K, basis, rhs = (_batch_first(x, d, info.batch_size) for x, d in zip(inputs[:3], in_dims[:3], strict=True))
         K = K.reshape(info.batch_size, *(1,) * (rhs.dim() + 1 - K.dim()), *K.shape[1:])
-        return _BasisSolve.apply(K, basis, rhs), 0
+        return _BasisSolve.apply(K, basis, rhs, inputs[3]), 0
 
 
 def _solve_block(K: Tensor, basis: Tensor, rhs: Tensor, pivot_tolerance: float, rank_tolerance: float) -> Tensor:

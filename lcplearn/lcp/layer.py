@@ -3,8 +3,9 @@
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lcplearn.lcp.methods import Method
 from lcplearn.lcp.solution import LCPSolution
-from lcplearn.lcp.solve import Method, check_options, solve_lcp
+from lcplearn.lcp.solve import check_options, solve_lcp
 
 
 class LCPLayer(nn.Module):

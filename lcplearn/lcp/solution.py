@@ -77,10 +77,7 @@ class LCPSolution(NamedTuple):
     def summary(self) -> dict[str, float]:
         """Figures for a training log: share of each status, worst residual of the solved, degenerate share."""
         count = max(self.status.numel(), 1)
-        shares = {
-            f"{status.name.lower()}_share": int((self.status == status).sum()) / count
-            for status in Status
-        }
+        shares = {f"{status.name.lower()}_share": int((self.status == status).sum()) / count for status in Status}
         solved = self.residual[self.solved]
         return {
             **shares,

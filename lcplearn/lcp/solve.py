@@ -1,21 +1,17 @@
-"""`solve_lcp`: check the arguments, choose a method, solve, judge."""
+"""`solve_lcp`: check the arguments, solve, differentiably."""
 
 import math
-import warnings
-from functools import cache, partial
-from types import ModuleType
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lcplearn.lcp.gradient import DifferentiableSolve
-from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, interior_point
-from lcplearn.lcp.residuals import default_tolerance, judge
-from lcplearn.lcp.solution import LCPSolution, Status
-
-Method = Literal["auto", "diagonal", "pivoting", "interior_point"]
+from lcplearn.lcp.compiled import traced_solve
+from lcplearn.lcp.gradient import differentiable_solve
+from lcplearn.lcp.methods import Method, Options
+from lcplearn.lcp.residuals import default_tolerance
+from lcplearn.lcp.solution import LCPSolution
 
 
 def solve_lcp(
@@ -65,21 +61,21 @@ def solve_lcp(
 
     Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992); lcp notes, sections 1 to 2.
     """
-    check_options(method, tol, max_iter, smoothing)
+    if not (method == "auto" and tol is None and max_iter is None and smoothing == 0):
+        check_options(method, tol, max_iter, smoothing)
     batch = _check_tensors(M, q, initial_basis)
-    if initial_basis is not None and method not in ("auto", "pivoting"):
-        raise ValueError(f"initial_basis needs method 'pivoting' or 'auto'; got method {method!r}")
     n = q.shape[-1]
-    if M.dim() > 2:
-        M = M.expand(*batch, n, n)
-    q = q.expand(*batch, n)
+    if len(M.shape) > 2 and M.shape[:-2] != batch:
+        M = M.reshape(n, n) if M.shape[:-2].numel() == 1 else M.expand(*batch, n, n)
+    if q.shape[:-1] != batch:
+        q = q.expand(*batch, n)
     if initial_basis is not None:
+        if method not in ("auto", "pivoting"):
+            raise ValueError(f"initial_basis needs method 'pivoting' or 'auto'; got method {method!r}")
         initial_basis = initial_basis.expand(*batch, n)
-    if method == "auto":
-        method = "pivoting" if smoothing == 0 and q.device.type == "cpu" and pivoting_kernel() else "interior_point"
-    run = _solve_by_pivoting if method == "pivoting" else partial(_solve_in_torch, method=method, smoothing=smoothing)
-    solve = partial(run, tol=tol or default_tolerance(q.dtype), max_iter=max_iter)
-    solution = LCPSolution(*DifferentiableSolve.apply(M, q, initial_basis, solve, smoothing > 0))
+    options = Options(method, tol or default_tolerance(q.dtype), max_iter, smoothing)
+    run = traced_solve if torch.compiler.is_compiling() else differentiable_solve
+    solution = run(M, q, initial_basis, options)
     if throw:
         solution.raise_if_unsolved()
     return solution
@@ -112,12 +108,7 @@ def _check_tensors(M: Tensor, q: Tensor, initial_basis: Tensor | None) -> torch.
         raise ValueError(f"M must have shape [*batch, n, n]; got {list(M.shape)}")
     if q.dim() < 1 or q.shape[-1] != M.shape[-1]:
         raise ValueError(f"q must have shape [*batch, {M.shape[-1]}] to match M {list(M.shape)}; got {list(q.shape)}")
-    try:
-        batch = torch.broadcast_shapes(M.shape[:-2], q.shape[:-1])
-    except RuntimeError:
-        raise ValueError(
-            f"batch dimensions of M {list(M.shape)} and q {list(q.shape)} must broadcast; they do not"
-        ) from None
+    batch = _broadcast(M.shape, q.shape)
     if initial_basis is not None and (
         initial_basis.dtype != torch.bool or initial_basis.shape not in (q.shape, (*batch, q.shape[-1]))
     ):
@@ -128,100 +119,13 @@ def _check_tensors(M: Tensor, q: Tensor, initial_basis: Tensor | None) -> torch.
     return batch
 
 
-@cache
-def pivoting_kernel() -> ModuleType | None:
-    """The numba kernel, imported on first use; None, with one warning, where numba is missing."""
+def _broadcast(M_shape: torch.Size, q_shape: torch.Size) -> torch.Size:
+    """The common batch shape; torch's own function takes longer than a small solve."""
+    if len(M_shape) == 2 or M_shape[:-2] == q_shape[:-1]:
+        return q_shape[:-1]
     try:
-        from lcplearn.lcp import pivoting
-    except ImportError as error:
-        warnings.warn(f"solving by interior point, many times slower on the CPU: {error}", stacklevel=4)
-        return None
-    return pivoting
-
-
-def _solve_by_pivoting(
-    M: Tensor, q: Tensor, initial_basis: Tensor | None, *, tol: float, max_iter: int | None
-) -> LCPSolution:
-    """Run the CPU kernel, which judges for itself with the same residual. A shared M is not copied."""
-    kernel = pivoting_kernel()
-    if kernel is None:
-        raise ValueError("method 'pivoting' needs numba; use 'interior_point' or 'auto'")
-    dtype, shape, n = q.dtype, q.shape, q.shape[-1]
-    result = kernel.solve_batch(
-        M.detach().reshape(-1 if n else math.prod(M.shape[:-2]), n, n).double().contiguous().numpy(),
-        q.detach().reshape(math.prod(shape[:-1]), n).double().contiguous().numpy(),
-        single_precision=dtype == torch.float32,
-        max_iter=max_iter,
-        tol=tol,
-        initial_basis=None if initial_basis is None else initial_basis.reshape(-1, n).numpy(),
-    )
-    z, w, basis, residual, status, iterations, certificate = map(torch.from_numpy, result)
-    batch = shape[:-1]
-    return LCPSolution(
-        z=z.to(dtype).reshape(shape),
-        w=w.to(dtype).reshape(shape),
-        basis=basis.reshape(shape),
-        status=status.reshape(batch),
-        residual=residual.reshape(batch),
-        iterations=iterations.reshape(batch),
-        certificate=certificate.to(dtype).reshape(shape),
-    )
-
-
-def _solve_in_torch(
-    M: Tensor,
-    q: Tensor,
-    initial_basis: Tensor | None,
-    *,
-    method: str,
-    smoothing: float,
-    tol: float,
-    max_iter: int | None,
-) -> LCPSolution:
-    """Solve without derivatives: flatten the batch, set aside what needs no solver, run the method, judge."""
-    del initial_basis
-    dtype, shape, n = q.dtype, q.shape, q.shape[-1]
-    count = math.prod(shape[:-1])
-    M = M.detach().expand(*shape, n).reshape(count, n, n).double()
-    q = q.detach().reshape(count, n).double()
-    finite = M.isfinite().all(-1).all(-1) & q.isfinite().all(-1)
-    end = Iterate(
-        z=torch.zeros_like(q),
-        w=q.clone(),
-        basis=torch.zeros_like(q, dtype=torch.bool),
-        iterations=torch.zeros(count, dtype=torch.int64, device=q.device),
-        exhausted=torch.zeros(count, dtype=torch.bool, device=q.device),
-    )
-    # q >= 0 is solved by z = 0 whatever M is.
-    todo = finite & ((q < 0).any(-1) | (smoothing > 0))
-    if todo.any():
-        if method == "diagonal":
-            found = _solve_diagonal(M[todo], q[todo])
-        else:
-            found = interior_point(M[todo], q[todo], max_iter=max_iter or DEFAULT_MAX_ITER, smoothing=smoothing)
-        for whole, part in zip(end, found, strict=True):
-            whole[todo] = part
-    residual, tolerance = judge(M, q, end.z, tol=tol, smoothing=smoothing)
-    failed = torch.where(end.exhausted, Status.MAX_ITERATIONS.value, Status.UNSOLVED.value)
-    status = torch.where(residual <= tolerance, Status.SOLVED.value, failed)
-    status = torch.where(finite, status, Status.NONFINITE_INPUT.value)
-    residual = torch.where(finite, residual, torch.inf)
-    nan = torch.where(finite, 0.0, torch.nan).unsqueeze(-1)
-    return LCPSolution(
-        z=(end.z + nan).to(dtype).reshape(shape),
-        w=(end.w + nan).to(dtype).reshape(shape),
-        basis=end.basis.reshape(shape),
-        status=status.reshape(shape[:-1]),
-        residual=residual.reshape(shape[:-1]),
-        iterations=end.iterations.reshape(shape[:-1]),
-        certificate=torch.zeros(shape, dtype=dtype, device=q.device),
-    )
-
-
-def _solve_diagonal(M: Tensor, q: Tensor) -> Iterate:
-    """Closed form for diagonal M; the judge, which sees all of M, catches one that is not."""
-    diagonal = M.diagonal(dim1=-2, dim2=-1)
-    basis = (q < 0) & (diagonal > 0)
-    z = torch.where(basis, -q / diagonal, 0.0)
-    zero = torch.zeros_like(q[:, 0])
-    return Iterate(z, q.clamp_min(0), basis, zero.long(), zero > 0)
+        return torch.broadcast_shapes(M_shape[:-2], q_shape[:-1])
+    except RuntimeError:
+        raise ValueError(
+            f"batch dimensions of M {list(M_shape)} and q {list(q_shape)} must broadcast; they do not"
+        ) from None

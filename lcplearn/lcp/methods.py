@@ -1,0 +1,141 @@
+"""The methods behind one signature, without derivatives: choose, solve, judge."""
+
+import math
+import warnings
+from functools import cache
+from types import ModuleType
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, interior_point
+from lcplearn.lcp.residuals import judge
+from lcplearn.lcp.solution import LCPSolution, Status
+
+Method = Literal["auto", "diagonal", "pivoting", "interior_point"]
+
+
+class Options(NamedTuple):
+    """How to solve: the checked keywords of `solve_lcp`."""
+
+    method: str
+    tol: float
+    max_iter: int | None
+    smoothing: float
+
+
+def solve(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:
+    """Solve q [*batch, n] with M [*batch, n, n], or [n, n] shared by the batch. Gradient mode must be off."""
+    if pivots(q, options):
+        return _solve_by_pivoting(M, q, initial_basis, options)
+    return _solve_in_torch(M, q, options)
+
+
+def pivots(q: Tensor, options: Options) -> bool:
+    """Whether the CPU kernel is the method: asked for, or the choice of "auto"."""
+    if options.method == "auto":
+        return q.is_cpu and options.smoothing == 0 and pivoting_kernel() is not None
+    return options.method == "pivoting"
+
+
+@cache
+def pivoting_kernel() -> ModuleType | None:
+    """The numba kernel, imported on first use; None, with one warning, where numba is missing."""
+    try:
+        from lcplearn.lcp import pivoting
+    except ImportError as error:
+        warnings.warn(f"solving by interior point, many times slower on the CPU: {error}", stacklevel=2)
+        return None
+    return pivoting
+
+
+def as_array(x: Tensor, *shape: int) -> np.ndarray:
+    """float64 array [*shape] on the tensor's memory; a copy only of what is not contiguous float64 already."""
+    return np.ascontiguousarray(x.numpy(), np.float64).reshape(shape)
+
+
+def as_tensor(x: np.ndarray, like: Tensor) -> Tensor:
+    """Tensor on the array's memory, of the shape and type of another."""
+    result = torch.from_numpy(x.reshape(like.shape))
+    return result if like.dtype is torch.float64 else result.to(like.dtype)
+
+
+def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:
+    """Run the CPU kernel, which judges for itself with the same residual."""
+    kernel = pivoting_kernel()
+    if kernel is None:
+        raise ValueError("method 'pivoting' needs numba; use 'interior_point' or 'auto'")
+    single = q.dtype is torch.float32
+    shape = tuple(q.shape)
+    batch, n = shape[:-1], shape[-1]
+    count = math.prod(batch)
+    result = kernel.solve_batch(
+        as_array(M, 1 if M.dim() == 2 else count, n, n),
+        as_array(q, count, n),
+        single_precision=single,
+        max_iter=options.max_iter,
+        tol=options.tol,
+        initial_basis=None if initial_basis is None else initial_basis.numpy().reshape(count, n),
+    )
+    z, w, basis, residual, status, iterations, certificate = result
+    if single:
+        z, w, certificate = (x.astype(np.float32) for x in (z, w, certificate))
+    if len(batch) != 1:
+        z, w, basis, certificate = (x.reshape(shape) for x in (z, w, basis, certificate))
+        status, residual, iterations = (x.reshape(batch) for x in (status, residual, iterations))
+    tensor = torch.from_numpy
+    return LCPSolution(
+        tensor(z), tensor(w), tensor(basis), tensor(status), tensor(residual), tensor(iterations), tensor(certificate)
+    )
+
+
+def _solve_in_torch(M: Tensor, q: Tensor, options: Options) -> LCPSolution:
+    """Flatten the batch, set aside what needs no solver, run the method, judge."""
+    method, tol, max_iter, smoothing = options
+    dtype, shape, n = q.dtype, q.shape, q.shape[-1]
+    count = math.prod(shape[:-1])
+    M = M.detach().expand(*shape, n).reshape(count, n, n).double()
+    q = q.detach().reshape(count, n).double()
+    finite = M.isfinite().all(-1).all(-1) & q.isfinite().all(-1)
+    end = Iterate(
+        z=torch.zeros_like(q),
+        w=q.clone(),
+        basis=torch.zeros_like(q, dtype=torch.bool),
+        iterations=torch.zeros(count, dtype=torch.int64, device=q.device),
+        exhausted=torch.zeros(count, dtype=torch.bool, device=q.device),
+    )
+    # q >= 0 is solved by z = 0 whatever M is.
+    todo = finite & ((q < 0).any(-1) | (smoothing > 0))
+    if todo.any():
+        if method == "diagonal":
+            found = _solve_diagonal(M[todo], q[todo])
+        else:
+            found = interior_point(M[todo], q[todo], max_iter=max_iter or DEFAULT_MAX_ITER, smoothing=smoothing)
+        for whole, part in zip(end, found, strict=True):
+            whole[todo] = part
+    residual, tolerance = judge(M, q, end.z, tol=tol, smoothing=smoothing)
+    failed = torch.where(end.exhausted, Status.MAX_ITERATIONS.value, Status.UNSOLVED.value)
+    status = torch.where(residual <= tolerance, Status.SOLVED.value, failed)
+    status = torch.where(finite, status, Status.NONFINITE_INPUT.value)
+    residual = torch.where(finite, residual, torch.inf)
+    nan = torch.where(finite, 0.0, torch.nan).unsqueeze(-1)
+    return LCPSolution(
+        z=(end.z + nan).to(dtype).reshape(shape),
+        w=(end.w + nan).to(dtype).reshape(shape),
+        basis=end.basis.reshape(shape),
+        status=status.reshape(shape[:-1]),
+        residual=residual.reshape(shape[:-1]),
+        iterations=end.iterations.reshape(shape[:-1]),
+        certificate=torch.zeros(shape, dtype=dtype, device=q.device),
+    )
+
+
+def _solve_diagonal(M: Tensor, q: Tensor) -> Iterate:
+    """Closed form for diagonal M; the judge, which sees all of M, catches one that is not."""
+    diagonal = M.diagonal(dim1=-2, dim2=-1)
+    basis = (q < 0) & (diagonal > 0)
+    z = torch.where(basis, -q / diagonal, 0.0)
+    zero = torch.zeros_like(q[:, 0])
+    return Iterate(z, q.clamp_min(0), basis, zero.long(), zero > 0)

@@ -1,0 +1,45 @@
+"""What other processes run in test_torch_processes.py; importable by name in a spawned process."""
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.utils.data import Dataset
+
+from lcplearn import LCPLayer, solve_lcp
+
+
+class SolvedProblems(Dataset):
+    """Item k is the solution of 2 z + q, q = -(k + 1), solved by the worker that loads it."""
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, k: int) -> Tensor:
+        return solve_lcp(2 * torch.eye(2, dtype=torch.float64), torch.full((2,), -k - 1.0, dtype=torch.float64)).z
+
+
+class LearnedProblem(nn.Module):
+    """A learned matrix shared by the batch, and a linear map to q."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.A = nn.Parameter(torch.eye(3, dtype=torch.float64) + 0.1 * torch.randn(3, 3, dtype=torch.float64))
+        self.q = nn.Linear(2, 3, dtype=torch.float64)
+        self.lcp = LCPLayer()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.lcp(self.A @ self.A.mT, self.q(x)).z
+
+
+def inputs() -> Tensor:
+    return torch.randn(8, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+def train_step_in_parallel(rank: int, folder: str) -> None:
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2)
+    model = nn.parallel.DistributedDataParallel(LearnedProblem())
+    model(inputs()[rank::2]).square().mean().backward()
+    torch.save([p.grad for p in model.parameters()], f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
