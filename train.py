@@ -20,7 +20,7 @@ CONF = Path(__file__).parent / "conf"
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> float:
-    """Build what the configuration says, train and test it; return the best validation loss, for sweepers."""
+    """Build what the configuration says, train and test it; return the best validation error, for sweepers."""
     try:
         return train(config)
     except (*MISTAKES, KeyboardInterrupt) as error:

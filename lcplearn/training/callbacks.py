@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from lcplearn.datasets import BlockData
 from lcplearn.training.metrics import one_step
-from lcplearn.training.module import FormulationModule
+from lcplearn.training.module import VALIDATION, FormulationModule
 
 TAGS = {
     "velocity_rmse": "val/velocity_rmse",
@@ -52,7 +52,7 @@ class Report(pl.Callback):
 
 
 class EarlyStop(EarlyStopping):
-    """Stop when the validation loss no longer improves; where LBFGS is to finish, not before it has begun."""
+    """Stop when the validation error no longer improves; where LBFGS is to finish, not before it has begun."""
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
         optimizer = pl_module.optimizer
@@ -93,8 +93,8 @@ class EpochBar(ProgressBar):
             self.bar.update()
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
-        if self.bar is not None and "val/loss" in trainer.callback_metrics:
-            values = {"val/loss": float(trainer.callback_metrics["val/loss"])} | pl_module.model.physical_parameters()
+        if self.bar is not None and VALIDATION in trainer.callback_metrics:
+            values = {VALIDATION: float(trainer.callback_metrics[VALIDATION])} | pl_module.model.physical_parameters()
             self.bar.set_postfix({name: f"{value:.3g}" for name, value in values.items()}, refresh=False)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:

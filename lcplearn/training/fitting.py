@@ -23,7 +23,7 @@ from lcplearn.training import figures
 from lcplearn.training.callbacks import BestCheckpoint, EarlyStop, EpochBar, LastCheckpoint, Report
 from lcplearn.training.checkpoint import check_resumable, describe, read
 from lcplearn.training.metrics import evaluate, table
-from lcplearn.training.module import FormulationModule
+from lcplearn.training.module import VALIDATION, FormulationModule
 from lcplearn.training.optimizer import Optimizer
 
 DEFAULTS = {"precision": "64-true", "accelerator": "cpu", "devices": 1, "enable_model_summary": False}
@@ -44,7 +44,7 @@ class Result:
     Attributes:
         model: The model with the parameters that validated best.
         metrics: Figures on the test data, see `metrics.KEYS`; None on processes other than the first.
-        validation: Smallest validation loss.
+        validation: Smallest velocity error on the validation data, over the steps of a window [m/s].
         folder: Folder of the run.
     """
 
@@ -104,13 +104,13 @@ def fit(
     loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
     chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
     every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
-    best = BestCheckpoint(folder, "best", monitor="val/loss", enable_version_counter=False)
+    best = BestCheckpoint(folder, "best", monitor=VALIDATION, enable_version_counter=False)
     last = LastCheckpoint(folder / "last.ckpt", every)
     callbacks: list[pl.Callback] = [best, last, Report(data), *chosen.pop("callbacks", [])]
     if chosen.get("enable_progress_bar", True):
         callbacks.append(EpochBar())
     if patience is not None:
-        callbacks.append(EarlyStop("val/loss", patience=patience))
+        callbacks.append(EarlyStop(VALIDATION, patience=patience))
     with _trainer_errors():
         lightning_trainer = pl.Trainer(
             default_root_dir=folder, callbacks=callbacks, logger=logger or False, num_sanity_val_steps=0, **chosen
@@ -179,7 +179,7 @@ def _log_results(
     if not isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_metrics(numbers)
         return
-    trainer.logger.log_hyperparams(hyperparameters, {"hp/best_val_loss": validation} | numbers)
+    trainer.logger.log_hyperparams(hyperparameters, {f"hp/best_{VALIDATION}": validation} | numbers)
     writer = trainer.logger.experiment
     rows = "".join(f"\n| {name} | {value} | {meaning} |" for name, value, meaning in table(metrics))
     writer.add_text("results", "| figure | value | meaning |\n|---|---|---|" + rows)

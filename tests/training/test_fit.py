@@ -185,7 +185,7 @@ def test_tensorboard_shows_losses_modes_residuals_parameters_figures_and_the_tab
     assert set(tags["scalars"]) >= {
         "loss/total", "loss/prediction", "val/loss", "val/velocity_rmse", "mode/stick_accuracy", "mode/false_stick",
         "residual/lcp", "solve/unsolved_share", "param/mu", "param/mu_true", "param/mass", "param/mass_true",
-        "hp/best_val_loss", "test/velocity_rmse",
+        "hp/best_val/rollout_rmse", "test/velocity_rmse",
     }  # fmt: skip
     assert set(tags["images"]) == {"one_step_map", "rollouts", "error_over_horizon"}
     assert "results/text_summary" in tags["tensors"]

@@ -64,7 +64,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_the_command_that_goes_on(tmp_path: Path)
                "optimizer=adam", "patience=null", *SMALL]  # fmt: skip
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
-    while "val/loss" not in process.stderr.read(40):
+    while "val/rollout_rmse" not in process.stderr.read(80):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
     errors = process.communicate(timeout=60)[1]
