@@ -1,0 +1,82 @@
+"""Figures of `benchmark scenes`."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lcplearn.benchmark.figures import BLACK, BLUE, GREEN, ORANGE, RED, SKY, Style, new_figure, one_legend
+from lcplearn.benchmark.study import Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LOOKS = {
+    "closed form": Style(GREEN, "^"),
+    "direct": Style(BLUE, "o"),
+    "direct, by pivoting": Style(ORANGE, "P", "-."),
+    "physical slack": Style(SKY, "v", "--"),
+    "traditional": Style(RED, "s"),
+    "full": Style(BLACK, "D", ":"),
+}
+ERRORS = {
+    "position_error": ("largest position error [m]", Style(BLUE, "o")),
+    "end_error": ("end error [m]", Style(GREEN, "s", "--")),
+    "energy_error": ("energy error / energy", Style(RED, "^", "-.")),
+    "penetration": ("penetration [m]", Style(BLACK, "v", ":")),
+}
+FLOOR = 1e-12  # smaller errors are rounding
+
+
+def time_bars(rows: Sequence[Row]) -> "Figure":
+    """Time of a step for each scene and formulation, one panel a batch size."""
+    batches = sorted({float(row["batch"]) for row in rows})
+    scenes = list(dict.fromkeys(str(row["scene"]) for row in rows))
+    figure, axes = new_figure(1, len(batches), width=8.0, height=3.6)
+    for ax, batch in zip(axes[0], batches, strict=True):
+        for name, look in LOOKS.items():
+            own = [row for row in rows if (row["formulation"], row["batch"]) == (name, batch)]
+            at = [scenes.index(str(row["scene"])) + 0.14 * (list(LOOKS).index(name) - 2.5) for row in own]
+            middle, low, high = (
+                np.array([float(row[column]) for row in own]) for column in ("step_us", "step_low_us", "step_high_us")
+            )
+            ax.bar(at, middle, 0.13, color=look.color, label=name, yerr=(middle - low, high - middle), ecolor="#777777")
+        ax.set_xticks(range(len(scenes)), [scene.replace(" ", "\n") for scene in scenes], fontsize=9)
+        ax.set_title(f"batch {batch:g}", fontsize=10)
+    axes[0, 0].set_ylabel("time of a step of one block [µs]")
+    one_legend(figure, axes, columns=6)
+    return figure
+
+
+def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
+    """Left: errors against step size; right: position error against time, a line a formulation."""
+    figure, axes = new_figure(1, 2, width=8.0, height=3.9)
+    left, right = axes[0]
+    direct = sorted((row for row in rows if row["formulation"] == "direct"), key=lambda row: float(row["dt"]))
+    dt = np.array([float(row["dt"]) for row in direct])
+    for column, (label, look) in ERRORS.items():
+        error = np.array([float(row[column]) for row in direct])
+        if (error > FLOOR).any():
+            left.loglog(dt[error > FLOOR], error[error > FLOOR], label=label, color=look.color, marker=look.marker,
+                        linestyle=look.linestyle, markersize=4)  # fmt: skip
+    left.loglog(dt, direct[0]["position_error"] * dt / dt[0], color="#999999", linewidth=0.8, label="first order")
+    left.set_xlabel("step size dt [s]")
+    left.set_ylabel("error")
+    left.legend(fontsize=8, frameon=False)
+    left.set_title(f"{scene}: errors, the same for all formulations", fontsize=10)
+    for name, look in LOOKS.items():
+        own = sorted((row for row in rows if row["formulation"] == name), key=lambda row: float(row["dt"]))
+        if not own:
+            continue
+        x, y = ([float(row[column]) for row in own] for column in ("seconds", "position_error"))
+        right.loglog(x, y, label=f"{name} ({own[0]['rows']:g})" if own[0]["rows"] else name, color=look.color,
+                     marker=look.marker, linestyle=look.linestyle, markersize=5)  # fmt: skip
+        if name == "direct":
+            for row, a, b in zip(own[1::3], x[1::3], y[1::3], strict=True):
+                label = f"dt {float(row['dt']):.2g}"
+                right.annotate(label, (a, b), (5, 3), textcoords="offset points", fontsize=7)
+    right.set_xlabel("time of a trajectory of 1 s [s]")
+    right.set_ylabel("largest position error [m]")
+    right.legend(fontsize=8, frameon=False, loc="lower left")
+    right.set_title("error against time (rows of the LCP)", fontsize=10)
+    return figure
