@@ -72,6 +72,13 @@ def new_figure(
     return figure, axes
 
 
+def whole_decades(ax: "Axes", axis: str) -> None:
+    """A logarithmic axis from one power of ten to another, so that it has at least two labels."""
+    low, high = ax.get_xlim() if axis == "x" else ax.get_ylim()
+    limits = 10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high))
+    ax.set(**{f"{axis}scale": "log", f"{axis}lim": limits})
+
+
 def one_legend(figure: "Figure", axes: np.ndarray, columns: int = 4) -> None:
     """One legend below all axes, each label once."""
     entries: dict[str, Any] = {}

@@ -1,7 +1,7 @@
 """What must hold of every result, checked without the code that is tested."""
 
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,14 +33,16 @@ def check(batch: Batch) -> list[Finding]:
     for method in ("pivoting", "interior_point"):
         solution = solve_lcp(M, q, method=method)
         findings += _check_solution(method, batch, solution)
-        findings += _check_gradient(method, M, q)
+        findings += _check_gradient(method, M, q, method=method)
         if method == "pivoting":
             findings += _check_alone(M, q, solution)
             findings += _check_solvable(batch, solution)
     with np.errstate(over="ignore", invalid="ignore"):
         single = batch._replace(M=batch.M.astype(np.float32), q=batch.q.astype(np.float32))
-    solution = solve_lcp(torch.from_numpy(single.M), torch.from_numpy(single.q))
+    M, q = torch.from_numpy(single.M), torch.from_numpy(single.q)
+    solution = solve_lcp(M, q)
     findings += _check_solution("pivoting float32", single, solution)
+    findings += _check_gradient("smoothed float32", M, q, smoothing=1e-10)
     return findings
 
 
@@ -179,21 +181,24 @@ def _check_solvable(batch: Batch, solution: LCPSolution) -> list[Finding]:
     return [Finding("missed", f"status {Status(int(solution.status[b])).name}", [b]) for b in missed]
 
 
-def _check_gradient(method: str, M: torch.Tensor, q: torch.Tensor) -> list[Finding]:
+def _check_gradient(name: str, M: torch.Tensor, q: torch.Tensor, **options: Any) -> list[Finding]:
     """Gradients are finite, and zero where unsolved."""
     M, q = M.clone().requires_grad_(), q.clone().requires_grad_()
-    solution = solve_lcp(M, q, method=method)  # type: ignore[arg-type]
+    solution = solve_lcp(M, q, **options)
     loss = torch.where(solution.solved, (solution.z + solution.w).sum(-1), 0.0).sum()
-    gradients = torch.autograd.grad(loss, (M, q)) if loss.requires_grad else ()
+    try:
+        gradients = torch.autograd.grad(loss, (M, q)) if loss.requires_grad else ()
+    except RuntimeError as error:  # LinAlgError is one
+        return [Finding(f"{name}: gradient raises", str(error), list(range(len(q))))]
+    huge = np.sqrt(HUGE_FLOAT32 if M.dtype == torch.float32 else HUGE)  # h z' is of size q / M^2
     findings = []
-    for name, gradient in zip("Mq", gradients, strict=False):
+    for of, gradient in zip("Mq", gradients, strict=False):
         flat = gradient.reshape(len(q), -1)
         for b in torch.nonzero(~flat.isfinite().all(1)).flatten().tolist():
-            if not _within(M[b].detach().numpy(), q[b].detach().numpy(), HUGE):
-                continue
-            findings.append(Finding(f"{method}: gradient not finite", f"with respect to {name}", [b]))
+            if _within(M[b].detach().numpy(), q[b].detach().numpy(), huge):
+                findings.append(Finding(f"{name}: gradient not finite", f"with respect to {of}", [b]))
         for b in torch.nonzero((flat != 0).any(1) & ~solution.solved).flatten().tolist():
-            findings.append(Finding(f"{method}: gradient of unsolved", f"with respect to {name}", [b]))
+            findings.append(Finding(f"{name}: gradient of unsolved", f"with respect to {of}", [b]))
     return findings
 
 

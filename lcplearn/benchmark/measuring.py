@@ -14,12 +14,18 @@ SHORTEST = 1e-3  # a sample repeats its call until it is this long [s], far abov
 
 
 class Timing(NamedTuple):
-    """Time of a call [s]: median and quartiles of the wall clock, median of the CPU time of all threads."""
+    """Time of a call [s]: median and quartiles of the wall clock, median and samples of the CPU time of all threads."""
 
     wall: float
     low: float
     high: float
     cpu: float
+    cpu_samples: np.ndarray
+
+    def over(self, other: "Timing") -> tuple[float, float, float]:
+        """CPU time over that of a call it was interleaved with: median and quartiles of the ratios of neighbours."""
+        low, middle, high = np.quantile(self.cpu_samples / other.cpu_samples, [0.25, 0.5, 0.75])
+        return float(middle), float(low), float(high)
 
 
 def interleave(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, Timing]:
@@ -40,24 +46,19 @@ def interleave(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str
     for name, values in samples.items():
         wall_times, cpu_times = np.array(values).T
         low, middle, high = np.quantile(wall_times, [0.25, 0.5, 0.75])
-        timings[name] = Timing(float(middle), float(low), float(high), float(np.median(cpu_times)))
+        timings[name] = Timing(float(middle), float(low), float(high), float(np.median(cpu_times)), cpu_times)
     return timings
 
 
 def _repeat_count(call: Callable[[], Any]) -> int:
-    start = time.perf_counter()
-    call()
-    return max(1, int(SHORTEST / max(time.perf_counter() - start, 1e-7)))
-
-
-def ratio(calls: Mapping[str, Callable[[], Any]], top: str, bottom: str, repeats: int) -> tuple[float, float, float]:
-    """Time of one call over that of another: median and quartiles of the ratios of neighbouring samples."""
-    pairs = []
-    for _ in range(repeats):
-        timing = interleave({top: calls[top], bottom: calls[bottom]}, 1)
-        pairs.append(timing[top].wall / timing[bottom].wall)
-    low, middle, high = np.quantile(pairs, [0.25, 0.5, 0.75])
-    return float(middle), float(low), float(high)
+    fastest = np.inf
+    for _ in range(3):  # one of them may be interrupted
+        start = time.perf_counter()
+        call()
+        fastest = min(fastest, time.perf_counter() - start)
+        if fastest > SHORTEST:
+            break
+    return max(1, int(SHORTEST / max(fastest, 1e-7)))
 
 
 def peak_memory(call: Callable[[], Any]) -> float:

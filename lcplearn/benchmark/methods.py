@@ -6,14 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Keywords of `solve_lcp`. The interior point ends on a basis, so that only fewer iterations make it less exact.
+# Keywords of `solve_lcp`. The interior point ends on a basis, to rounding; stopped at a coarser tolerance it is the
+# smoothed solution of that complementarity.
 METHODS: dict[str, dict[str, Any]] = {
     "pivoting": {"method": "pivoting"},
     "interior_point": {"method": "interior_point"},
-    "interior_point 12 iterations": {"method": "interior_point", "max_iter": 12},
-    "interior_point 6 iterations": {"method": "interior_point", "max_iter": 6},
-    "smoothed 1e-12": {"smoothing": 1e-12},
-    "smoothed 1e-8": {"smoothing": 1e-8},
+    "smoothed 1e-10": {"smoothing": 1e-10},
+    "smoothed 1e-7": {"smoothing": 1e-7},
     "smoothed 1e-4": {"smoothing": 1e-4},
     "diagonal": {"method": "diagonal"},
 }

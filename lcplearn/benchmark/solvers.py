@@ -1,0 +1,250 @@
+"""`benchmark solvers`: time of a problem against its residual, and of a gradient against its error.
+
+Every method and installed peer on every family, batch 1 to 10,000, float64 and float32, in turns in one process.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lcplearn import solve_lcp
+from lcplearn.benchmark import problems
+from lcplearn.benchmark.gradient_error import Reference, gradient_errors, reference
+from lcplearn.benchmark.measuring import exponent, interleave, peak_memory
+from lcplearn.benchmark.methods import METHODS, missing_peers, peers
+from lcplearn.benchmark.problems import Problems
+from lcplearn.benchmark.solver_figures import (
+    draw_gradients,
+    draw_growth,
+    draw_work_precision,
+)
+from lcplearn.benchmark.study import Options, Row, Study, Table, Value
+from lcplearn.lcp.residuals import default_tolerance, judge
+
+Family = Callable[[np.random.Generator, int], Problems]
+KEY = ("family", "batch", "precision")
+COLUMNS = (
+    "method", "n", "forward_us", "forward_low_us", "forward_high_us", "forward_cpu_us", "backward_us",
+    "backward_cpu_us", "residual", "worst_residual", "solved", "judged_solved", "gradient_error",
+    "worst_gradient_error", "peak_mb",
+)  # fmt: skip
+BATCHES, QUICK_BATCHES = (1, 10, 100, 1000, 10_000), (1, 100)
+QUICK_FAMILIES = ("F1 sliding block direct n=2", "F3 polygon n=8", "F4 cube n=24", "F5 positive definite n=10")
+LARGEST = 256e6  # bytes of M
+LONGEST, LONGEST_QUICK = 4.0, 0.5  # seconds of one call; a method that needs more is left out at that batch
+GRADIENTS = 100  # problems whose gradients are checked
+
+
+def families(quick: bool) -> dict[str, Family]:
+    """The random families, and sizes between theirs for the growth in n."""
+    if quick:
+        return {name: problems.RANDOM_FAMILIES[name] for name in QUICK_FAMILIES}
+    found = dict(problems.RANDOM_FAMILIES)
+    for n in (1, 2, 5, 20):
+        found[f"F5 positive definite n={n}"] = lambda rng, B, n=n: problems.positive_definite(rng, B, n)  # type: ignore[misc]
+        found[f"F7 nonsymmetric P n={n}"] = lambda rng, B, n=n: problems.nonsymmetric(rng, B, n)  # type: ignore[misc]
+    found["F7 nonsymmetric P n=100"] = lambda rng, B: problems.nonsymmetric(rng, B, 100)
+    found["F4 stacked cubes n=96"] = lambda rng, B: problems.stacked_cubes(rng, B, 4)
+    return found
+
+
+def run(options: Options) -> None:
+    """Measure, print and draw."""
+    study = Study("solvers", options, KEY, COLUMNS)
+    chosen = families(options.quick)
+    if missing_peers():
+        print(missing_peers())
+    for key in study.remaining(plan(chosen, options.quick), seconds=1.0 if options.quick else 12.0):
+        family, batch, precision = str(key[0]), int(key[1]), str(key[2])
+        data = chosen[family](np.random.default_rng([options.seed, batch]), batch)
+        study.add(key, *measure(family, data, getattr(torch, precision), options))
+    _say(study, 100 if options.quick else 1000)
+    study.finish()
+
+
+def plan(chosen: Iterable[str], quick: bool) -> Iterator[tuple[str, int, str]]:
+    """Every family at every batch in float64, and at the middle one in float32."""
+    for family in chosen:
+        n = size(family)
+        batches = [batch for batch in (QUICK_BATCHES if quick else BATCHES) if 8 * batch * n * n <= LARGEST]
+        for batch in batches:
+            yield family, batch, "float64"
+        yield family, 100 if quick else 1000, "float32"
+
+
+def size(family: str) -> int:
+    """n, from a family's name."""
+    found = re.search(r"n=(\d+)", family)
+    if found is None:
+        raise ValueError(f"the name of family {family!r} must say n=..., its size")
+    return int(found[1])
+
+
+def measure(family: str, data: Problems, dtype: torch.dtype, options: Options) -> list[Row]:
+    """A row for each method that is applicable and fast enough."""
+    # What float32 data mean is their rounded values.
+    data = data._replace(M=_rounded(data.M, dtype), q=_rounded(data.q, dtype))
+    M, q = torch.from_numpy(data.M), torch.from_numpy(data.q)
+    count, longest = len(data.q), LONGEST_QUICK if options.quick else LONGEST
+    diagonal = bool((data.M * np.eye(data.M.shape[-1]) == data.M).all())
+    forward: dict[str, Callable[[], Any]] = {}
+    backward: dict[str, Callable[[], Any]] = {}
+    found: dict[str, Tensor] = {}
+    for name, keywords in METHODS.items():
+        if name == "diagonal" and not diagonal:
+            continue
+        inputs = M.to(dtype), q.to(dtype)
+        if _seconds(_forward(inputs[0][:8], inputs[1][:8], keywords)) * max(count / 8, 1) > longest:
+            continue
+        forward[name] = _forward(*inputs, keywords)
+        forward[name]()
+        leaves = inputs[0].clone().requires_grad_(), inputs[1].clone().requires_grad_()
+        z = solve_lcp(*leaves, **keywords).z
+        found[name] = z.detach().double()
+        backward[name] = _backward(z, leaves)
+        backward[name]()
+    for name, peer in peers().items():
+        peer(data.M[:8], data.q[:8])
+        forward[name] = partial(peer, data.M, data.q)
+        found[name] = torch.from_numpy(forward[name]().z)
+    repeats = 3 if options.quick else 5
+    times, back = interleave(forward, repeats), interleave(backward, repeats)
+    checked = Problems(data.M[:GRADIENTS], data.q[:GRADIENTS], None if data.z is None else data.z[:GRADIENTS])
+    truth = reference(family, checked, options.seed) if count >= 10 else None
+    rows: list[Row] = []
+    tolerance = default_tolerance(dtype)
+    for name, z in found.items():
+        verdict = judge(M, q, z, tol=tolerance)
+        natural = torch.minimum(z, (M @ z[..., None])[..., 0] + q).abs().amax(-1) / (1 + q.abs().amax(-1))
+        row: Row = {
+            "method": name,
+            "n": data.q.shape[-1],
+            "forward_us": 1e6 * times[name].wall / count,
+            "forward_low_us": 1e6 * times[name].low / count,
+            "forward_high_us": 1e6 * times[name].high / count,
+            "forward_cpu_us": 1e6 * times[name].cpu / count,
+            "residual": float(natural.median()),
+            "worst_residual": float(natural.max()),
+            "solved": float((natural <= tolerance).double().mean()),
+            "judged_solved": float((verdict.residual <= verdict.tolerance).double().mean()),
+            "peak_mb": peak_memory(forward[name]) / 1e6,
+        }
+        if name in backward:
+            row |= {"backward_us": 1e6 * back[name].wall / count, "backward_cpu_us": 1e6 * back[name].cpu / count}
+            row |= _gradient_columns(checked, truth, dtype, METHODS[name])
+        rows.append(row)
+    return rows
+
+
+def _rounded(x: np.ndarray, dtype: torch.dtype) -> np.ndarray:
+    return x.astype(np.float32).astype(np.float64) if dtype == torch.float32 else x
+
+
+def _forward(M: Tensor, q: Tensor, keywords: dict[str, Any]) -> Callable[[], Any]:
+    return lambda: solve_lcp(M, q, **keywords)
+
+
+def _backward(z: Tensor, inputs: tuple[Tensor, Tensor]) -> Callable[[], Any]:
+    ones = torch.ones_like(z)
+    return lambda: torch.autograd.grad(z, inputs, ones, retain_graph=True)
+
+
+def _seconds(call: Callable[[], Any]) -> float:
+    call()  # compiles
+    return interleave({"call": call}, 1)["call"].wall
+
+
+def _gradient_columns(
+    data: Problems, truth: Reference | None, dtype: torch.dtype, keywords: dict[str, Any]
+) -> dict[str, float]:
+    errors = gradient_errors(data, truth, dtype, **keywords) if truth else np.empty(0)
+    if not len(errors):
+        return {}
+    return {"gradient_error": float(np.median(errors)), "worst_gradient_error": float(errors.max())}
+
+
+def _say(study: Study, batch: int) -> None:
+    """The findings, from the rows alone."""
+    at_batch = [row for row in study.rows if row["batch"] == batch]
+    double = [row for row in at_batch if row["precision"] == "float64"]
+    study.say(
+        "Which solver is fastest for the accuracy I need?",
+        f"{_speed(double)} Residuals max |min(z, w)| / (1 + max |q|) are recomputed from the data; bars are quartiles "
+        f"over repeats; time of a problem in a batch of {batch}. Hollow: fewer than 99 % of the problems solved.",
+        figure=draw_work_precision(double),
+    )
+    with_gradient = [row for row in double if isinstance(row["gradient_error"], float)]
+    study.say(
+        "Which gradient can I trust, and what does it cost?",
+        f"{_gradients(with_gradient)} The error is that of the slope of a unique quantity (velocity, or z of a "
+        "P-matrix) along a line of problems.",
+        figure=draw_gradients(with_gradient),
+    )
+    study.say(
+        "How does time grow with batch and size?",
+        "Slope of the logarithm of wall time of a call against that of batch size (from batch 100, where the fixed "
+        "cost of a call no longer shows), and of the time of a problem against n.",
+        table=_growth(study.rows, batch),
+        figure=draw_growth(study.rows, batch),
+    )
+    for precision in ("float64", "float32"):
+        rows = [row for row in at_batch if row["precision"] == precision]
+        columns = (
+            "family", "method", "forward_us", "forward_cpu_us", "backward_us", "residual", "worst_residual", "solved",
+            "judged_solved", "gradient_error", "worst_gradient_error", "peak_mb",
+        )  # fmt: skip
+        table = Table([c.replace("_", " ") for c in columns], [[row[c] for c in columns] for row in rows])
+        study.say(f"All methods at batch {batch}, {precision}", missing_peers(), table=table)
+
+
+def _speed(rows: list[Row]) -> str:
+    """A sentence: by how much pivoting is faster than each other method, over the families."""
+    parts = []
+    for name in dict.fromkeys(str(row["method"]) for row in rows):
+        others = {row["family"]: row for row in rows if row["method"] == name}
+        pairs = [
+            (row, others[row["family"]]) for row in rows if row["method"] == "pivoting" and row["family"] in others
+        ]
+        if name == "pivoting" or not pairs:
+            continue
+        ratios = [float(other["forward_cpu_us"]) / float(own["forward_cpu_us"]) for own, other in pairs]
+        parts.append(f"{name} {np.exp(np.mean(np.log(ratios))):.2g} ({min(ratios):.2g} to {max(ratios):.2g})")
+    worst = max(float(row["worst_residual"]) for row in rows if row["method"] == "pivoting")
+    return f"CPU time over that of pivoting (worst residual {worst:.1g}), geometric mean and range over families: " + (
+        "; ".join(parts) + "."
+    )
+
+
+def _gradients(rows: list[Row]) -> str:
+    parts = []
+    for name in dict.fromkeys(str(row["method"]) for row in rows):
+        errors = [float(row["gradient_error"]) for row in rows if row["method"] == name]
+        parts.append(f"{name} {np.median(errors):.1g} (worst family {max(errors):.1g})")
+    return "Median relative error: " + "; ".join(parts) + "."
+
+
+def _growth(rows: list[Row], batch: int) -> Table:
+    """Exponents in batch and in n by method."""
+    double = [row for row in rows if row["precision"] == "float64"]
+    lines: list[list[Value]] = []
+    for name in dict.fromkeys(str(row["method"]) for row in double):
+        own = [row for row in double if row["method"] == name]
+        in_batch = []
+        for family in dict.fromkeys(row["family"] for row in own):
+            points = [(float(r["batch"]), float(r["batch"]) * float(r["forward_us"])) for r in own
+                      if r["family"] == family and float(r["batch"]) >= 100]  # fmt: skip
+            in_batch.append(exponent(*zip(*points, strict=True)) if len(points) > 1 else np.nan)
+        in_n = []
+        for prefix in ("F5", "F7", "F4 stacked"):
+            points = [(float(r["n"]), float(r["forward_us"])) for r in own
+                      if str(r["family"]).startswith(prefix) and "ratio" not in str(r["family"])
+                      and r["batch"] == batch and float(r["n"]) >= 10]  # fmt: skip
+            in_n.append(exponent(*zip(*points, strict=True)) if len(points) > 1 else np.nan)
+        known = [value for value in in_batch if value == value]
+        lines.append([name, float(np.median(known)) if known else np.nan, *in_n])
+    return Table(["method", "in batch", "in n, F5", "in n, F7", "in n, stacked cubes"], lines)
