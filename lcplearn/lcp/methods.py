@@ -67,6 +67,8 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
     kernel = pivoting_kernel()
     if kernel is None:
         raise ValueError("method 'pivoting' needs numba; use 'interior_point' or 'auto'")
+    if not q.is_cpu:
+        raise ValueError(f"method 'pivoting' runs on the CPU; got M and q on {q.device}")
     single = q.dtype is torch.float32
     shape = tuple(q.shape)
     batch, n = shape[:-1], shape[-1]
@@ -81,10 +83,10 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
     )
     z, w, basis, residual, status, iterations, certificate = result
     if single:
-        z, w, certificate = (x.astype(np.float32) for x in (z, w, certificate))
+        z, w, certificate = z.astype(np.float32), w.astype(np.float32), certificate.astype(np.float32)
     if len(batch) != 1:
-        z, w, basis, certificate = (x.reshape(shape) for x in (z, w, basis, certificate))
-        status, residual, iterations = (x.reshape(batch) for x in (status, residual, iterations))
+        z, w, basis, certificate = z.reshape(shape), w.reshape(shape), basis.reshape(shape), certificate.reshape(shape)
+        status, residual, iterations = status.reshape(batch), residual.reshape(batch), iterations.reshape(batch)
     tensor = torch.from_numpy
     return LCPSolution(
         tensor(z), tensor(w), tensor(basis), tensor(status), tensor(residual), tensor(iterations), tensor(certificate)

@@ -72,7 +72,7 @@ class LCPSolution(NamedTuple):
         """Members at a kink, z_i = w_i = 0 up to 1e-8 of the largest entries: their gradient is one-sided."""
         z_scale = self.z.abs().amax(-1, keepdim=True) if self.z.shape[-1] else self.z
         w_scale = self.w.abs().amax(-1, keepdim=True) if self.w.shape[-1] else self.w
-        return (self.z <= 1e-8 * z_scale) & (self.w <= 1e-8 * w_scale)
+        return (self.z <= 1e-8 * z_scale) & (self.w <= 1e-8 * w_scale) & self.solved.unsqueeze(-1)
 
     def summary(self) -> dict[str, float]:
         """Figures for a training log: share of each status, worst residual of the solved, degenerate share."""

@@ -53,8 +53,11 @@ def solve_lcp(
 
     Gradient:
         Implicit, with respect to M and q through z and w; the derivation is in `gradient.py`. At a kink
-        (z_i = w_i = 0, see `LCPSolution.degenerate`) it is the one-sided derivative of the piece the solver ended on.
+        (z_i = w_i = 0, see `LCPSolution.degenerate`) it is the derivative of the piece the solver ended on: one-sided
+        where one member is degenerate; where several are, their piece may be valid in no direction.
         Zero for an element that is not SOLVED. An M or q shared by the batch gets the sum over the batch.
+        Forward mode, higher derivatives and torch.func work in eager code. torch.compile sees a solve as one operator
+        with a first derivative in reverse mode; asking it for more raises.
 
     Raises:
         ValueError: An argument is wrong; the message names it.

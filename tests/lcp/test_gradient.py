@@ -1,11 +1,13 @@
 """Derivatives of `solve_lcp`: against finite differences, at kinks, in batches, where blocks are singular."""
 
+import numpy as np
 import pytest
 import torch
 from lcp.oracles import planted, random_family
 from torch.autograd import gradcheck, gradgradcheck
 
 from lcplearn import solve_lcp
+from lcplearn.benchmark.problems import stacked_cubes
 
 METHODS = ("pivoting", "interior_point")
 FRICTION = [[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]]  # notes 2.5 with mass = dt = 1
@@ -184,3 +186,84 @@ def test_float32_gradient_has_float32_type_and_accuracy(method):
     solve_lcp(M32, q32, method=method).z.square().sum().backward()
     assert M32.grad.dtype == torch.float32
     torch.testing.assert_close(M32.grad, M.grad.float(), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_does_not_depend_on_units_where_every_member_is_basic(method):
+    """A second pivot of 1e-12 beside a first of 1e12 is no zero."""
+    generator = torch.Generator().manual_seed(1)
+    M = random_family("positive definite", 16, 6, generator)
+    q = -M.sum(-1).requires_grad_()
+    scale = 10 ** (12 * torch.rand(16, 6, generator=generator) - 6)
+    (expected,) = torch.autograd.grad(solve_lcp(M, q, method=method).z.square().sum(), q)
+    z = scale * solve_lcp(scale.unsqueeze(-1) * M * scale.unsqueeze(-2), scale * q, method=method).z
+    torch.testing.assert_close(torch.autograd.grad(z.square().sum(), q)[0], expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_backward_in_the_kernel_equals_backward_in_torch(shared, dtype):
+    """The kernel serves a plain backward, torch's operations one that is differentiated again."""
+    M, q = (x.detach() for x in problem("nonsymmetric definite", batch=16, n=7))
+    leaves = (M[0] if shared else M).to(dtype).requires_grad_(), q.to(dtype).requires_grad_()
+    solution = solve_lcp(*leaves, method="pivoting")
+    loss = solution.z.square().sum() + solution.w.sin().sum()
+    in_kernel = torch.autograd.grad(loss, leaves, retain_graph=True)
+    in_torch = torch.autograd.grad(loss, leaves, create_graph=True)
+    torch.testing.assert_close(in_kernel, in_torch)
+
+
+def cube_on_the_ground(batch: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """M, q of cubes with four contacts, dq of a random change of velocity, and c that weighs contact velocities.
+
+    q and dq lie in the range of the contact Jacobian J, whose rows M_JJ = J W J' spans.
+    """
+    rng = np.random.default_rng(0)
+    M, q = map(torch.from_numpy, stacked_cubes(rng, batch)[:2])
+    J = slice(0, 20)
+    dq = torch.zeros_like(q)
+    dq[:, J] = (M[:, J, J] @ torch.from_numpy(rng.standard_normal((batch, 20, 1)))).squeeze(-1)
+    return M, q, dq, torch.from_numpy(rng.standard_normal(20))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_of_the_next_velocity_of_a_cube_on_four_contacts_is_exact_where_it_is_unique(method):
+    """Its impulses are not unique: three contacts would carry it. J v' = (M z + q)_J without the slack's columns."""
+    M, q, dq, c = cube_on_the_ground(64)
+
+    def velocity(t, method=method):
+        z = solve_lcp(M, q + t.unsqueeze(-1) * dq, method=method).z
+        return (M[:, :20, :20] @ z[:, :20].unsqueeze(-1)).squeeze(-1) + (q + t.unsqueeze(-1) * dq)[:, :20]
+
+    t = torch.zeros(64).requires_grad_()
+    (gradient,) = torch.autograd.grad((velocity(t) @ c).sum(), t)
+    with torch.no_grad():
+        here, h = velocity(t), 1e-5
+        one, other = ((velocity(t + s * h) @ c - here @ c) / (s * h) for s in (1, -1))
+        unique = torch.stack(
+            [(velocity(t + s * h, m) - velocity(t + s * h)).abs().amax(-1) < 1e-9 for m in METHODS for s in (0, 1, -1)]
+        ).all(0)
+    smooth = unique & ((one - other).abs() < 1e-6)
+    error = ((gradient - (one + other) / 2).abs() / (1 + gradient.abs()))[smooth]
+    assert smooth.sum() >= 32
+    assert error.max() <= 1e-6
+    assert error.median() <= 1e-9
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_at_a_kink_is_that_of_one_of_its_two_sides(method):
+    """One member with z_i = w_i = 0: along any direction, z follows one linear piece forwards and another backwards."""
+    generator = torch.Generator().manual_seed(3)
+    M = random_family("nonsymmetric definite", 16, 5, generator)
+    q, z = planted(M, generator)
+    w = (M @ z.unsqueeze(-1)).squeeze(-1) + q
+    z[:, 0], w[:, 0] = 0.0, 0.0
+    q = (w - (M @ z.unsqueeze(-1)).squeeze(-1)).requires_grad_()
+    solution = solve_lcp(M, q, method=method)
+    assert torch.equal(solution.degenerate, torch.arange(5).expand(16, 5) == 0)
+    direction, c, h = torch.randn(16, 5, generator=generator), torch.randn(5, generator=generator), 1e-6
+    slope = (torch.autograd.grad((solution.z @ c).sum(), q)[0] * direction).sum(-1)
+    sides = [((solve_lcp(M, q.detach() + s * h * direction, method=method).z - z) @ c) / (s * h) for s in (1, -1)]
+    distance = torch.stack([(slope - side).abs() for side in sides])
+    assert distance.amin(0).max() < 1e-6
+    assert distance.amax(0).max() > 1e-3  # the sides do differ

@@ -141,3 +141,8 @@ def test_without_numba_auto_warns_once_and_solves_by_interior_point(monkeypatch)
             solve_lcp(M, q, method="pivoting")
     finally:
         pivoting_kernel.cache_clear()
+
+
+def test_pivoting_refuses_other_devices():
+    with pytest.raises(ValueError, match="'pivoting' runs on the CPU; got M and q on meta"):
+        solve_lcp(torch.eye(2, device="meta"), torch.ones(2, device="meta"), method="pivoting")
