@@ -55,6 +55,15 @@ def test_compiled_code_takes_float32_an_initial_basis_and_inputs_without_gradien
     torch.testing.assert_close(q.grad, torch.autograd.grad(solve_lcp(M, q).z.sum(), q)[0])
 
 
+def test_one_compilation_serves_all_batch_sizes():
+    M, q = (x.detach() for x in problem())
+    solve = torch.compile(lambda M, q: solve_lcp(M, q).z, backend="aot_eager", fullgraph=True, dynamic=True)
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        for batch in (3, 2, 7):
+            many = M.repeat(3, 1, 1)[:batch], q.repeat(3, 1)[:batch]
+            assert torch.equal(solve(*many), solve_lcp(*many).z)
+
+
 def test_compiled_vmap_equals_the_batch():
     M, q = (x.detach() for x in problem())
     z = compiled(torch.func.vmap(lambda M, q: solve_lcp(M, q).z))(M, q)
