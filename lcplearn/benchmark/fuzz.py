@@ -90,7 +90,7 @@ def write_finding(folder: Path, case: Batch, finding: Finding, seed: int, index:
         solvable=case.solvable,
         kind=case.kind,
         check=finding.check,
-        message=finding.message,
+        message=" ".join(finding.message.split()),
     )
     return path
 
@@ -105,7 +105,8 @@ def replay(path: Path) -> list[Finding]:
     except Exception:  # noqa: BLE001 - whatever the solver raises is what is being looked for
         findings = [Finding("crash", traceback.format_exc(), [0])]
     for finding in findings:
-        print(f"  {finding.check}: {finding.message} (elements {finding.elements[:5]})")
+        message = " ".join(finding.message.split())
+        print(f"  {finding.check}: {message} (elements {finding.elements[:5]})")
     if not findings:
         print("  nothing wrong now")
     return findings

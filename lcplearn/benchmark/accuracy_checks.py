@@ -1,0 +1,160 @@
+"""Is every status true, every residual small, every gradient right?"""
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+
+import numpy as np
+import torch
+
+from lcplearn.benchmark import problems
+from lcplearn.benchmark.check import Check, Finding, skipped
+from lcplearn.benchmark.gradient_error import gradient_errors, reference
+from lcplearn.benchmark.hard_cases import HardCase, hard_families, published_cases
+from lcplearn.benchmark.problems import Problems
+from lcplearn.benchmark.solving import solve
+from lcplearn.benchmark.study import Options
+
+CHUNK = 250  # problems that are in memory at once
+Family = Callable[[np.random.Generator, int], Problems]
+
+
+def _repeated(textbook: Callable[[int], Problems], low: int, high: int) -> Family:
+    """A textbook family as random ones: sizes drawn at random, one size a chunk."""
+
+    def make(rng: np.random.Generator, B: int) -> Problems:
+        one = textbook(int(rng.integers(low, high)))
+        M, q, z = (None if x is None else np.repeat(x, B, 0) for x in one)
+        return Problems(M, q, z)  # type: ignore[arg-type]
+
+    return make
+
+
+FAMILIES: dict[str, Family] = {
+    **problems.RANDOM_FAMILIES,
+    "Murty n=2..20": _repeated(problems.murty, 2, 21),
+    "Murty easy n=2..20": _repeated(partial(problems.murty, easy=True), 2, 21),
+    "Fathi n=2..20": _repeated(problems.fathi, 2, 21),
+}
+FULL_COUNT = 2500  # problems a family: 55,000 in all
+
+
+def family_names(quick: bool) -> list[str]:
+    """Families, without the large ones in a quick run."""
+    return _without_large(FAMILIES, quick)
+
+
+def _without_large(names: Iterable[str], quick: bool) -> list[str]:
+    return [name for name in names if not (quick and any(size in name for size in ("n=48", "n=50", "n=100")))]
+
+
+def chunks(family: str, count: int, seed: int) -> Iterator[Problems]:
+    """`count` problems of a family, a chunk at a time."""
+    for index in range(0, count, CHUNK):
+        yield FAMILIES[family](np.random.default_rng([seed, index]), min(CHUNK, count - index))
+
+
+def check_family(family: str, options: Options, *, method: str, share: float) -> Finding:
+    """Worst residual of all, how many are not SOLVED, and how many claim what the residual denies."""
+    count = 40 if options.quick else int(share * FULL_COUNT)
+    worst, unsolved, wrong = 0.0, 0, 0
+    single = "float32" in method
+    for M, q, _ in chunks(family, count, options.seed):
+        if single:
+            M, q = (x.astype(np.float32).astype(np.float64) for x in (M, q))
+        answer = solve(method, M, q)
+        if answer is None:
+            return skipped("does not apply")
+        claims = np.array([status == "SOLVED" for status in answer.statuses])
+        w = (M @ answer.z[..., None])[..., 0] + q
+        r = np.abs(np.minimum(answer.z, w)).max(1) / (1 + np.abs(q).max(1))
+        worst = max(worst, float(r[claims].max(initial=0.0)))
+        unsolved += int((~claims).sum())
+        wrong += int((claims & ~(answer.residual <= 2 * answer.tolerance)).sum())
+    limit = 1e-4 if single else 1e-9 if "ratio 1e3" in family else 1e-10
+    words = f"{count} problems, {unsolved} not SOLVED, {wrong} wrongly SOLVED"
+    accurate = worst <= limit and wrong == 0
+    must_solve = method == "pivoting"
+    return Finding(worst, accurate and (unsolved == 0 or not must_solve), accurate and unsolved == 0, words)
+
+
+def check_published(method: str, options: Options) -> Finding:
+    """Unsolvable cases must not be SOLVED, nor any case wrongly; all solvable ones should be, to 1e-8 max |q|."""
+    try:
+        cases = published_cases(30 if options.quick else 400)
+    except FileNotFoundError as error:
+        return skipped(str(error))
+    worst, false, missed = 0.0, [], []
+    for case in cases:
+        answer = solve(method, case.M[None], case.q[None])
+        if answer is None:
+            continue
+        status, solvable = answer.statuses[0], "SOLVED" in case.right
+        r = np.abs(np.minimum(answer.z[0], case.M @ answer.z[0] + case.q)).max() / np.abs(case.q).max()
+        if status == "SOLVED":
+            worst = max(worst, float(r))
+        if (status == "SOLVED") != solvable or (status == "SOLVED" and r > 1e-8):
+            (missed if solvable and status != "SOLVED" else false).append(f"{case.name} {status}")
+    words = f"{len(cases)} cases; wrong: {', '.join(false) or 'none'}; not SOLVED: {', '.join(missed) or 'none'}"
+    return Finding(worst, not false, not false and not missed, words)
+
+
+def check_hard(family: str, options: Options, *, method: str) -> Finding:
+    """Share of a hard family's cases that behave as they should; what is unique in them must be right."""
+    cases = [case for case in hard_families() if case.family == family]
+    bad = [f"{case.name} ({reason})" for case in cases if (reason := _misbehaves(case, method))]
+    words = f"{len(cases)} cases" + (f"; not so: {', '.join(bad)}" if bad else "")
+    return Finding(1 - len(bad) / len(cases), not bad, not bad, words)
+
+
+def _misbehaves(case: HardCase, method: str) -> str:
+    answer = solve(method, case.M[None], case.q[None])
+    if answer is None:
+        return ""
+    status = answer.statuses[0]
+    if status not in case.right:
+        return status
+    if status == "SOLVED" and not answer.residual[0] <= answer.tolerance[0]:
+        return f"residual {answer.residual[0]:.1g}"
+    if status == "SOLVED" and case.read is not None and case.value is not None:
+        error = np.abs(case.read @ answer.z[0] - case.value).max() / max(np.abs(case.value).max(), 1e-300)
+        if case.value.any() and error > case.tolerance:
+            return f"off by {error:.1g}"
+    return ""
+
+
+def check_gradient(case: str, options: Options) -> Finding:
+    """Median relative error of slopes of unique quantities."""
+    count, rng = 40 if options.quick else 1000, np.random.default_rng(options.seed)
+    if case.startswith("redundant"):
+        k = 8
+        stiffness, speed = rng.uniform(0.5, 2.0, (2, count))
+        data = Problems(np.ones((count, k, k)) * stiffness[:, None, None], -np.ones((count, k)) * speed[:, None], None)
+    else:
+        data = problems.RANDOM_FAMILIES[case](rng, count)
+    truth = reference(case, data, options.seed)
+    errors = gradient_errors(data, truth, torch.float64, method="pivoting")
+    median, largest = float(np.median(errors)), float(errors.max())
+    words = f"{len(errors)} of {count} have a reference; largest {largest:.1g}"
+    return Finding(median, median <= 1e-9, median <= 1e-10 and largest <= 1e-6, words)
+
+
+_GRADIENT_CASES = [name for name in problems.RANDOM_FAMILIES if name[:2] in ("F3", "F4", "F7")] + [
+    "redundant contacts k=8"
+]
+_HARD = list(dict.fromkeys(case.family for case in hard_families()))
+
+CHECKS = (
+    Check("families solved by pivoting", "all SOLVED, r <= 1e-10 (mass ratio 1e3: 1e-9), no false status", "",
+          "worst r", family_names, partial(check_family, method="pivoting", share=1.0), 6.0),
+    Check("families through interior_point", "never a wrong SOLVED", "all SOLVED", "worst r",
+          family_names, partial(check_family, method="interior_point", share=0.1), 10.0),
+    Check("families rounded to float32", "residual at the data's precision, statuses true", "all SOLVED", "worst r",
+          family_names, partial(check_family, method="pivoting float32", share=0.2), 3.0),
+    Check("published cases", "none wrongly SOLVED", "every solvable one SOLVED to 1e-8 max |q|", "worst r / max |q|",
+          lambda quick: ["pivoting", "interior_point"], check_published, 20.0),
+    Check("hard families, pivoting", "behaves as it should", "", "share right",
+          lambda quick: _HARD, partial(check_hard, method="pivoting"), 0.2, True),
+    Check("gradients of unique quantities", "median relative error <= 1e-9", "median <= 1e-10, largest <= 1e-6",
+          "median error", partial(_without_large, _GRADIENT_CASES),
+          check_gradient, 3.0),
+)  # fmt: skip
