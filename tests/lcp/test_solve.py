@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import arrays
 from lcp.oracles import FAMILIES, has_solution, natural_residual, planted, random_family
 
 from lcplearn import LCPError, LCPLayer, Status, solve_lcp
+from lcplearn.lcp.residuals import judge
 
 METHODS = ("pivoting", "interior_point")
 entries = st.integers(-3, 3)
@@ -100,6 +101,15 @@ def test_diagonal_method_is_the_closed_form(pairs):
 def test_diagonal_method_never_calls_a_coupled_problem_solved():
     M = torch.tensor([[2.0, -1.0], [-1.0, 2.0]])
     assert solve_lcp(M, -torch.ones(2), method="diagonal").status == Status.UNSOLVED
+
+
+@given(st.lists(st.tuples(st.sampled_from([-1.0, 0.0, 1e-12, 1.0, 1e300]), st.sampled_from([-1e300, -1.0, 0.0, 1.0]))))
+def test_diagonal_problem_is_judged_in_closed_form_as_by_the_general_judge(pairs):
+    d, q = torch.tensor(pairs).reshape(-1, 2).unbind(-1)
+    solution = solve_lcp(torch.diag(d), q, method="diagonal")
+    judgement = judge(torch.diag(d), q, solution.z, tol=1e-10)
+    assert solution.solved == (judgement.residual <= judgement.tolerance)
+    assert solution.solved == bool(((q >= 0) | (d > 0)).all()) or not solution.z.isfinite().all()
 
 
 @pytest.mark.parametrize("method", METHODS)
