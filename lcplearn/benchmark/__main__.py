@@ -47,9 +47,9 @@ def _run(options: argparse.Namespace) -> None:
 
     torch.set_num_threads(options.threads)
     if options.command == "fuzz":
-        from lcplearn.benchmark import fuzz
+        from lcplearn.benchmark.fuzz import run as run_fuzz
 
-        fuzz.run(options)
+        run_fuzz(options)
         return
     from lcplearn.benchmark.study import Options
 

@@ -75,7 +75,7 @@ def _draw_ratios(rows: Sequence[Row]) -> "Figure":
         (speed_checks.AGAINST_QUANTECON, "quantecon", (1.0, 1.3)),
         (speed_checks.AGAINST_INTERIOR_POINT, "interior_point", (10.0,)),
     )
-    figure, axes = new_figure(1, 2, width=9.0, height=5.5)
+    figure, axes = new_figure(1, 2, width=10.0, height=5.5)
     for ax, (name, method, lines) in zip(axes[0], panels, strict=True):
         own = [row for row in rows if row["check"] == name and row["figure"] == row["figure"]]
         places = np.arange(len(own))[::-1]
@@ -83,7 +83,8 @@ def _draw_ratios(rows: Sequence[Row]) -> "Figure":
         ax.set_yticks(places, [str(row["case"]) for row in own], fontsize=8)
         for value in lines:
             ax.axvline(value, color="black", linewidth=1.0, linestyle=":")
-        ax.set(xlabel=f"CPU time of {method} / pivoting [-]", title="must and goal dotted" if lines else "")
+        ax.set_xlabel(f"times faster than {method} [-]")
+        ax.set_title("dotted: must" + (" and goal" if len(lines) > 1 else ""), fontsize=10)
         if method == "interior_point":
             ax.set_xscale("log")
     return figure

@@ -83,7 +83,9 @@ def check_published(method: str, options: Options) -> Finding:
         cases = published_cases(30 if options.quick else 400)
     except FileNotFoundError as error:
         return skipped(str(error))
-    worst, false, missed = 0.0, [], []
+    worst = 0.0
+    false: list[str] = []
+    missed: list[str] = []
     for case in cases:
         answer = solve(method, case.M[None], case.q[None])
         if answer is None:

@@ -143,7 +143,7 @@ def _wrong_certificate(kind: str, M: np.ndarray, q: np.ndarray, certificate: np.
 
 def _within(M: np.ndarray, q: np.ndarray, huge: float) -> bool:
     """Whether all sizes are between 1 / huge and huge, zeros aside."""
-    size = np.abs(np.concatenate([M.ravel(), q]))
+    size = np.abs(np.concatenate([M.ravel(), q])).astype(np.float64)
     size = size[size > 0]
     return not len(size) or bool(size.max() < huge and size.min() > 1 / huge)
 

@@ -1,7 +1,6 @@
 """Time, memory and slopes: what is compared runs in turns in one process."""
 
 import ctypes
-import gc
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -65,7 +64,6 @@ def peak_memory(call: Callable[[], Any]) -> float:
     """Most memory [bytes] held at once during a call beyond what was held before it; NaN where Linux can't tell."""
     if not sys.platform.startswith("linux"):
         return float("nan")
-    gc.collect()
     ctypes.CDLL(None).malloc_trim(0)  # give freed memory back, else a call would seem to need none
     try:
         Path("/proc/self/clear_refs").write_text("5")  # forget the earlier peak

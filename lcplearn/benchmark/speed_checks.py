@@ -67,7 +67,12 @@ def check_quantecon(family: str, options: Options) -> Finding:
     ratio, low, high = times["quantecon"].over(times["kernel"])
     through_torch, _, _ = times["quantecon"].over(times["torch"])
     microseconds = 1e6 * times["kernel"].cpu / len(q)
-    words = f"{low:.2f} to {high:.2f}; through torch {through_torch:.2f}; {microseconds:.3g} us a problem"
+    z = peers()["quantecon"](M, q).z
+    right = np.abs(np.minimum(z, (M @ z[..., None])[..., 0] + q)).max(1) <= 1e-6 * (1 + np.abs(q).max(1))
+    words = (
+        f"{low:.2f} to {high:.2f}; through torch {through_torch:.2f}; {microseconds:.3g} us a problem; "
+        f"quantecon solves {right.mean():.1%} to 1e-6"
+    )
     return Finding(ratio, ratio >= 1.0, ratio >= (1.5 if q.shape[1] >= 20 else 1.3), words)
 
 
@@ -80,7 +85,11 @@ def check_sequence(family: str, options: Options) -> Finding:
     before = _kernel(M, q)
     q = q + DRIFT * line(family, data, options.seed).dq
     start = partial(_kernel, M, q, initial_basis=before.basis)
-    calls = {"quantecon": partial(peers()["quantecon"], M, q), "from basis": start, "cold": partial(_kernel, M, q)}
+    calls: dict[str, Callable[[], Any]] = {
+        "quantecon": partial(peers()["quantecon"], M, q),
+        "from basis": start,
+        "cold": partial(_kernel, M, q),
+    }
     times = _in_turns(calls, options)
     ratio, low, high = times["quantecon"].over(times["from basis"])
     kept = float((start().basis == before.basis).all(1).mean())
@@ -96,8 +105,11 @@ def check_interior_point(family: str, options: Options, *, batch: int) -> Findin
     if batch == 1:
         hard = int(np.argmin(q.min(1)))  # one that z = 0 does not solve
         tensors = tensors[0][hard], tensors[1][hard]
-    methods = ("pivoting", "interior_point")
-    times = _in_turns({name: partial(solve_lcp, *tensors, method=name) for name in methods}, options, repeats=3)
+    calls: dict[str, Callable[[], Any]] = {
+        "pivoting": partial(solve_lcp, *tensors, method="pivoting"),
+        "interior_point": partial(solve_lcp, *tensors, method="interior_point"),
+    }
+    times = _in_turns(calls, options, repeats=3)
     ratio, low, high = times["interior_point"].over(times["pivoting"])
     floor = 100 if batch == 1 else 10
     return Finding(ratio, ratio >= floor, ratio >= floor, f"{low:.3g} to {high:.3g}")
