@@ -67,7 +67,7 @@ def test_what_a_case_calls_unique_belongs_to_a_solution(case):
     assert stability.relative_error(case, z) <= case.tolerance
 
 
-@pytest.mark.parametrize(("method", "every"), [("pivoting", 1), ("interior_point", 9)])  # it takes 1 s a case
+@pytest.mark.parametrize(("method", "every"), [("pivoting", 1), ("interior_point", 15)])  # 1 s a case
 def test_no_hard_case_gets_a_wrong_answer(method, every):
     rows = [(case.name, stability.case_row(case, method)) for case in CASES[::every]]
     assert not [(name, row) for name, row in rows if row["verdict"] == "wrong"]
