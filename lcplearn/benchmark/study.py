@@ -97,7 +97,8 @@ class Study:
         cost = sum(seconds(*key) if callable(seconds) else seconds for key in todo)
         known = f", {len(keys) - len(todo)} of them known already" if len(todo) < len(keys) else ""
         sys.stderr.write(f"{self.name}: {len(keys)} measurements{known}; about {_duration(cost)} to go\n")
-        yield from tqdm(todo, unit="key", disable=None, smoothing=0.1)
+        # In a log file a line every half minute is enough.
+        yield from tqdm(todo, unit="key", smoothing=0.1, mininterval=0.1 if sys.stderr.isatty() else 30.0)
 
     def add(self, key: Sequence[Value], *rows: Mapping[str, Value]) -> None:
         """Keep the rows of a key (at least one), on disk before this returns; a column left out is empty.
