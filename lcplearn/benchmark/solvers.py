@@ -6,7 +6,7 @@ Every method and installed peer on every family, batch 1 to 10,000, float64 and 
 import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -85,73 +85,80 @@ def size(family: str) -> int:
     return int(found[1])
 
 
+class Calls(NamedTuple):
+    """Forward and backward of each method that is applicable and fast enough, and the z [B, n] it found."""
+
+    forward: dict[str, Callable[[], Any]]
+    backward: dict[str, Callable[[], Any]]
+    z: dict[str, Tensor]
+
+
 def measure(family: str, data: Problems, dtype: torch.dtype, options: Options) -> list[Row]:
     """A row for each method that is applicable and fast enough."""
     # What float32 data mean is their rounded values.
     data = data._replace(M=_rounded(data.M, dtype), q=_rounded(data.q, dtype))
-    M, q = torch.from_numpy(data.M), torch.from_numpy(data.q)
-    count, longest = len(data.q), LONGEST_QUICK if options.quick else LONGEST
-    diagonal = bool((data.M * np.eye(data.M.shape[-1]) == data.M).all())
-    forward: dict[str, Callable[[], Any]] = {}
-    backward: dict[str, Callable[[], Any]] = {}
-    found: dict[str, Tensor] = {}
-    for name, keywords in METHODS.items():
-        if name == "diagonal" and not diagonal:
-            continue
-        inputs = M.to(dtype), q.to(dtype)
-        if _seconds(_forward(inputs[0][:8], inputs[1][:8], keywords)) * max(count / 8, 1) > longest:
-            continue
-        forward[name] = _forward(*inputs, keywords)
-        forward[name]()
-        leaves = inputs[0].clone().requires_grad_(), inputs[1].clone().requires_grad_()
-        z = solve_lcp(*leaves, **keywords).z
-        found[name] = z.detach().double()
-        backward[name] = _backward(z, leaves)
-        backward[name]()
-    for name, peer in peers().items():
-        peer(data.M[:8], data.q[:8])
-        forward[name] = partial(peer, data.M, data.q)
-        found[name] = torch.from_numpy(forward[name]().z)
-    repeats = 3 if options.quick else 5
-    times, back = interleave(forward, repeats), interleave(backward, repeats)
+    calls = _calls(data, dtype, LONGEST_QUICK if options.quick else LONGEST)
+    repeats, count = 3 if options.quick else 5, len(data.q)
+    forward, backward = interleave(calls.forward, repeats), interleave(calls.backward, repeats)
     checked = Problems(data.M[:GRADIENTS], data.q[:GRADIENTS], None if data.z is None else data.z[:GRADIENTS])
     truth = reference(family, checked, options.seed) if count >= 10 else None
     rows: list[Row] = []
-    tolerance = default_tolerance(dtype)
-    for name, z in found.items():
-        verdict = judge(M, q, z, tol=tolerance)
-        natural = torch.minimum(z, (M @ z[..., None])[..., 0] + q).abs().amax(-1) / (1 + q.abs().amax(-1))
+    for name, z in calls.z.items():
+        time = forward[name]
         row: Row = {
             "method": name,
             "n": data.q.shape[-1],
-            "forward_us": 1e6 * times[name].wall / count,
-            "forward_low_us": 1e6 * times[name].low / count,
-            "forward_high_us": 1e6 * times[name].high / count,
-            "forward_cpu_us": 1e6 * times[name].cpu / count,
-            "residual": float(natural.median()),
-            "worst_residual": float(natural.max()),
-            "solved": float((natural <= tolerance).double().mean()),
-            "judged_solved": float((verdict.residual <= verdict.tolerance).double().mean()),
-            "peak_mb": peak_memory(forward[name]) / 1e6,
+            "forward_us": 1e6 * time.wall / count,
+            "forward_low_us": 1e6 * time.low / count,
+            "forward_high_us": 1e6 * time.high / count,
+            "forward_cpu_us": 1e6 * time.cpu / count,
+            "peak_mb": peak_memory(calls.forward[name]) / 1e6,
+            **_residuals(data, z, default_tolerance(dtype)),
         }
         if name in backward:
-            row |= {"backward_us": 1e6 * back[name].wall / count, "backward_cpu_us": 1e6 * back[name].cpu / count}
+            time = backward[name]
+            row |= {"backward_us": 1e6 * time.wall / count, "backward_cpu_us": 1e6 * time.cpu / count}
             row |= _gradient_columns(checked, truth, dtype, METHODS[name])
         rows.append(row)
     return rows
 
 
+def _calls(data: Problems, dtype: torch.dtype, longest: float) -> Calls:
+    """Each call has run once, so that nothing is left to compile or allocate."""
+    calls = Calls({}, {}, {})
+    M, q = torch.from_numpy(data.M).to(dtype), torch.from_numpy(data.q).to(dtype)
+    diagonal = bool((data.M * np.eye(data.M.shape[-1]) == data.M).all())
+    for name, keywords in METHODS.items():
+        few = partial(solve_lcp, M[:8], q[:8], **keywords)
+        if (name == "diagonal" and not diagonal) or _seconds(few) * max(len(q) / 8, 1) > longest:
+            continue
+        calls.forward[name] = partial(solve_lcp, M, q, **keywords)
+        calls.forward[name]()
+        leaves = M.clone().requires_grad_(), q.clone().requires_grad_()
+        z = solve_lcp(*leaves, **keywords).z
+        calls.z[name] = z.detach().double()
+        calls.backward[name] = partial(torch.autograd.grad, z, leaves, torch.ones_like(z), retain_graph=True)
+        calls.backward[name]()
+    for name, peer in peers().items():
+        calls.forward[name] = partial(peer, data.M, data.q)
+        calls.z[name] = torch.from_numpy(calls.forward[name]().z)
+    return calls
+
+
+def _residuals(data: Problems, z: Tensor, tolerance: float) -> dict[str, float]:
+    M, q = torch.from_numpy(data.M), torch.from_numpy(data.q)
+    verdict = judge(M, q, z, tol=tolerance)
+    natural = torch.minimum(z, (M @ z[..., None])[..., 0] + q).abs().amax(-1) / (1 + q.abs().amax(-1))
+    return {
+        "residual": float(natural.median()),
+        "worst_residual": float(natural.max()),
+        "solved": float((natural <= tolerance).double().mean()),
+        "judged_solved": float((verdict.residual <= verdict.tolerance).double().mean()),
+    }
+
+
 def _rounded(x: np.ndarray, dtype: torch.dtype) -> np.ndarray:
     return x.astype(np.float32).astype(np.float64) if dtype == torch.float32 else x
-
-
-def _forward(M: Tensor, q: Tensor, keywords: dict[str, Any]) -> Callable[[], Any]:
-    return lambda: solve_lcp(M, q, **keywords)
-
-
-def _backward(z: Tensor, inputs: tuple[Tensor, Tensor]) -> Callable[[], Any]:
-    ones = torch.ones_like(z)
-    return lambda: torch.autograd.grad(z, inputs, ones, retain_graph=True)
 
 
 def _seconds(call: Callable[[], Any]) -> float:
