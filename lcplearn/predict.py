@@ -19,7 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.datasets import BlockData, Recordings, read_cube_slides
+from lcplearn.datasets import BlockData, read_all_cube_slides, read_recordings
+from lcplearn.datasets.files import read_npz
 from lcplearn.formulations import Formulation
 from lcplearn.scenes.rollout import Mode, Trajectory
 from lcplearn.training.checkpoint import load
@@ -52,8 +53,7 @@ def read_inputs(path: str | Path) -> Inputs:
         raise ValueError(f"There is no input file {path}.")
     arrays = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix, _unknown)(path)
     if "forces" not in arrays:
-        wanted = "column 'force'" if path.suffix == ".csv" else "array 'forces'"
-        raise ValueError(f"{path} has no {wanted}; it has {', '.join(arrays) or 'nothing'}.")
+        raise ValueError(f"{path} has no column 'force'; it has {', '.join(arrays) or 'nothing'}.")
     tensors = {key: torch.as_tensor(value, dtype=torch.float64) for key, value in arrays.items()}
     forces, friction, state = tensors["forces"], tensors.get("friction"), tensors.get("state")
     for name, tensor in (("forces", forces), ("friction", friction), ("state", state)):
@@ -63,8 +63,8 @@ def read_inputs(path: str | Path) -> Inputs:
         raise ValueError(f"{path}: forces must have at least one step.")
     if friction is not None and friction.shape != (*forces.shape, 2):
         raise ValueError(f"{path}: friction must have shape {[*forces.shape, 2]}, got {list(friction.shape)}.")
-    if state is not None and state.shape[-1:] != (2,):
-        raise ValueError(f"{path}: state must be position and velocity, got shape {list(state.shape)}.")
+    if state is not None and state.shape not in ((2,), (*forces.shape[:-1], 2)):
+        raise ValueError(f"{path}: state must have shape {[*forces.shape[:-1], 2]} or [2], got {list(state.shape)}.")
     return Inputs(forces[..., None], friction, state)
 
 
@@ -78,7 +78,7 @@ def predict(model: Formulation, inputs: Inputs, state: Float[Tensor, "*batch 2"]
         state: Position [m] and velocity [m/s] at the start; the inputs' own, else rest at 0, by default.
 
     Raises:
-        ValueError: the model needs measured friction and the inputs have none.
+        ValueError: the model needs measured friction and the inputs have none, or the state is not finite.
     """
     if model.needs_friction and inputs.friction is None:
         raise ValueError(
@@ -87,8 +87,9 @@ def predict(model: Formulation, inputs: Inputs, state: Float[Tensor, "*batch 2"]
         )
     if state is None:
         state = inputs.state if inputs.state is not None else torch.zeros(2, dtype=torch.float64)
-    friction = inputs.friction if model.needs_friction else None
-    return model.rollout(state.expand(*inputs.forces.shape[:-2], 2), inputs.forces, friction)
+    if not bool(state.isfinite().all()):
+        raise ValueError(f"state: expected finite position and velocity, got {state.tolist()}.")
+    return model.rollout(state, inputs.forces, inputs.friction if model.needs_friction else None)
 
 
 def write(path: str | Path, trajectory: Trajectory, dt: float) -> None:
@@ -118,24 +119,11 @@ def read_data(path: str | Path, model: Formulation) -> BlockData:
     """Read recordings to score a model on; all of them are the test.
 
     Raises:
+        FileNotFoundError: no such file.
         ValueError: not a file of recordings, or one with another time step than the model's.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"There is no data file {path}.")
-    if path.suffix != ".npz":
-        raise ValueError(f"{path} must be an NPZ file of recordings, like cube_slides.npz.")
-    with _opened(path) as file:
-        slides, content = "offsets" in file, set(file.files)
-    if slides:
-        data = read_cube_slides(path, training_slides=2, validation_slides=1)
-        data = _replace(data, _join([data.train, data.validation, data.test]))
-    else:
-        needed = {"positions", "velocities", "forces", "dt"}
-        if needed - content:
-            missing, there = (", ".join(sorted(names)) for names in (needed - content, content))
-            raise ValueError(f"{path} lacks {missing}; it has {there}.")
-        data = _simulated(path, model)
+    slides = "offsets" in read_npz(path, (), optional=("offsets",))
+    data = read_all_cube_slides(path) if slides else read_recordings(path, gravity=model.gravity)
     if abs(data.dt / model.dt - 1.0) > 1e-9:
         raise ValueError(f"{path} has time steps of {data.dt:.6g} s, but the model was trained for {model.dt:.6g} s.")
     if model.needs_friction and data.test.friction is None:
@@ -156,6 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--state", nargs=2, type=float, metavar=("POSITION", "VELOCITY"), help="start [m, m/s]")
     parser.add_argument("--plot", metavar="PNG", help="picture of the motion")
     options = parser.parse_args(arguments)
+    if options.score and (options.state or options.plot):
+        parser.error("--state and --plot go with --input")
     try:
         _score(options) if options.score else _predict(options)
     except (ValueError, OSError) as error:
@@ -206,9 +196,12 @@ def _draw(inputs: Inputs, trajectory: Trajectory, dt: float) -> Any:
 
 
 def _read_csv(path: Path) -> dict[str, Any]:
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        rows, header = list(reader), list(reader.fieldnames or [])
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a file with a byte order mark
+            reader = csv.DictReader(file, skipinitialspace=True)
+            rows, header = list(reader), list(reader.fieldnames or [])
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is not a CSV file: {error}.") from None
 
     def column(name: str) -> list[float]:
         values = []
@@ -228,51 +221,15 @@ def _read_csv(path: Path) -> dict[str, Any]:
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
-    with _opened(path) as file:
-        arrays = {name: file[name] for name in file.files if name in ("forces", "friction", "state")}
+    arrays = read_npz(path, ("forces",), optional=("friction", "state"))
+    text = [name for name, array in arrays.items() if array.dtype.kind == "U"]
+    if text:
+        raise ValueError(f"{path}: {text[0]} must be numbers, got text.")
     return arrays
-
-
-def _opened(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path} is not an NPZ file: {error}") from None
 
 
 def _unknown(path: Path) -> Any:
     raise ValueError(f"{path} must end in .csv or .npz.")
-
-
-def _simulated(path: Path, model: Formulation) -> BlockData:
-    with _opened(path) as file:
-        arrays = {name: torch.as_tensor(file[name]) for name in file.files}
-    count, steps = arrays["forces"].shape
-    arrays.setdefault("steps", torch.full((count,), steps))
-    test = Recordings(*(arrays.get(name) for name in Recordings._fields))  # type: ignore[arg-type]
-    known = {name: float(arrays[name]) if name in arrays else None for name in ("mu", "mass")}
-    return BlockData("sliding_block", test, test, test, test, float(arrays["dt"]), model.gravity, **known)
-
-
-def _replace(data: BlockData, test: Recordings) -> BlockData:
-    return BlockData(data.kind, data.train, data.validation, test, None, data.dt, data.gravity, data.mass, data.mu)
-
-
-def _join(parts: Sequence[Recordings]) -> Recordings:
-    """Put recordings together, padded at the end with their last value."""
-    steps = max(part.forces.shape[1] for part in parts)
-
-    def padded(values: Tensor, length: int) -> Tensor:
-        return torch.cat((values, values[:, -1:].expand(-1, length - values.shape[1])), dim=1)
-
-    return Recordings(
-        positions=torch.cat([padded(part.positions, steps + 1) for part in parts]),
-        velocities=torch.cat([padded(part.velocities, steps + 1) for part in parts]),
-        forces=torch.cat([padded(part.forces, steps) for part in parts]),
-        friction=None,
-        steps=torch.cat([part.steps for part in parts]),
-        true_velocities=None,
-    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Recordings of blocks, simulated and real, and batches of them."""
 
-from lcplearn.datasets.cube_slides import read_cube_slides
+from lcplearn.datasets.cube_slides import read_all_cube_slides, read_cube_slides
 from lcplearn.datasets.files import find
 from lcplearn.datasets.loader import WindowLoader
-from lcplearn.datasets.recordings import BlockData, Recordings, windows
+from lcplearn.datasets.recordings import BlockData, Recordings, read_recordings, windows
 from lcplearn.datasets.simulate import simulate_falling_block, simulate_sliding_block
 
 __all__ = [
@@ -11,7 +11,9 @@ __all__ = [
     "Recordings",
     "WindowLoader",
     "find",
+    "read_all_cube_slides",
     "read_cube_slides",
+    "read_recordings",
     "simulate_falling_block",
     "simulate_sliding_block",
     "windows",

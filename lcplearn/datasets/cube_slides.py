@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lcplearn.datasets.files import check_offsets, find, read_npz
+from lcplearn.datasets.files import check_offsets, find, positive_number, read_npz
 from lcplearn.datasets.recordings import BlockData, Recordings
 
 FILE = "cube_slides.npz"
@@ -34,8 +34,42 @@ def read_cube_slides(
         ValueError: The file is not what `lcplearn.datasets.contactnets` writes, or has too few slides for the split.
     """
     path = find(FILE) if path is None else Path(path)
+    slides, constants = _read(path)
+    count = len(slides)
+    if not 0 < validation_slides < training_slides < count:
+        raise ValueError(
+            "training_slides, validation_slides: expected 0 < validation_slides < training_slides < "
+            f"{count} (the slides in {path}), got {training_slides} and {validation_slides}"
+        )
+    slides = [slides[k] for k in torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()]
+    learning = training_slides - validation_slides
+    return BlockData(
+        kind="cube_slides",
+        train=_recordings(slides[:learning]),
+        validation=_recordings(slides[learning:training_slides]),
+        test=_recordings(slides[training_slides:]),
+        test_long=None,
+        mu=None,
+        **constants,
+    )
+
+
+def read_all_cube_slides(path: Path | str) -> BlockData:
+    """Real slides as `read_cube_slides` has them, but all of them in each part: to score a model that is trained.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not what `lcplearn.datasets.contactnets` writes.
+    """
+    slides, constants = _read(Path(path))
+    everything = _recordings(slides)
+    return BlockData("cube_slides", everything, everything, everything, None, mu=None, **constants)
+
+
+def _read(path: Path) -> tuple[list[NDArray], dict[str, float]]:
+    """Rows of each slide, and dt, gravity and mass."""
     arrays = read_npz(path, ("data", "offsets", "columns", "dt", "g", "mass_kg"))
-    data, offsets, dt = arrays["data"], arrays["offsets"], float(_scalar(path, "dt", arrays["dt"]))
+    data, offsets = arrays["data"], arrays["offsets"]
     columns = tuple(str(name) for name in np.atleast_1d(arrays["columns"]))
     if columns != COLUMNS or data.ndim != 2 or data.shape[1] != len(COLUMNS) or data.dtype.kind != "f":
         raise ValueError(
@@ -45,32 +79,11 @@ def read_cube_slides(
     if len(data) == 0:
         raise ValueError(f"{path}: expected at least one slide, got no rows")
     check_offsets(path, offsets, len(data))
-    count = len(offsets) - 1
-    if not 0 < validation_slides < training_slides < count:
-        raise ValueError(
-            "training_slides, validation_slides: expected 0 < validation_slides < training_slides < "
-            f"{count} (the slides in {path}), got {training_slides} and {validation_slides}"
-        )
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
-    slides = [data[offsets[k] : offsets[k + 1]] for k in order]
-    learning = training_slides - validation_slides
-    return BlockData(
-        kind="cube_slides",
-        train=_recordings(slides[:learning]),
-        validation=_recordings(slides[learning:training_slides]),
-        test=_recordings(slides[training_slides:]),
-        test_long=None,
-        dt=dt,
-        gravity=float(_scalar(path, "g", arrays["g"])),
-        mass=float(_scalar(path, "mass_kg", arrays["mass_kg"])),
-        mu=None,
-    )
-
-
-def _scalar(path: Path, name: str, value: NDArray) -> NDArray:
-    if value.size != 1 or value.dtype.kind != "f" or not value.item() > 0:
-        raise ValueError(f"{path}: {name}: expected one positive number, got {value}")
-    return value
+    constants = {
+        name: positive_number(path, key, arrays[key])
+        for name, key in (("dt", "dt"), ("gravity", "g"), ("mass", "mass_kg"))
+    }
+    return np.split(data, offsets[1:-1]), constants
 
 
 def _recordings(slides: list[NDArray]) -> Recordings:

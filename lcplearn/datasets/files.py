@@ -23,15 +23,16 @@ def find(name: str) -> Path:
     return path
 
 
-def read_npz(path: Path | str, keys: tuple[str, ...]) -> dict[str, NDArray]:
+def read_npz(path: Path | str, keys: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray]:
     """Arrays of an NPZ file, without ever running a pickle.
 
     Args:
         path: The file.
         keys: Names of the arrays that it must hold.
+        optional: Names of arrays that it may hold.
 
     Returns:
-        These arrays by name.
+        These arrays by name, as far as they are there.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -46,8 +47,11 @@ def read_npz(path: Path | str, keys: tuple[str, ...]) -> dict[str, NDArray]:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             missing = [key for key in keys if key not in file]
             if missing:
-                raise ValueError(f"expected the arrays {', '.join(keys)}, {', '.join(missing)} missing")
-            arrays = {key: np.asarray(file[key]) for key in keys}  # a member that is no array comes as bytes
+                raise ValueError(
+                    f"expected the arrays {', '.join(keys)}; {', '.join(missing)} missing; got {', '.join(file)}"
+                )
+            there = [*keys, *(key for key in optional if key in file)]
+            arrays = {key: np.asarray(file[key]) for key in there}  # a member that is no array comes as bytes
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         reason = "arrays of Python objects (pickles) are not read" if "allow_pickle" in str(error) else error
         raise ValueError(f"{path}: {reason}") from None
@@ -57,6 +61,17 @@ def read_npz(path: Path | str, keys: tuple[str, ...]) -> dict[str, NDArray]:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{path}: {key}: {int((~np.isfinite(array)).sum())} values are NaN or infinite")
     return arrays
+
+
+def positive_number(path: Path | str, name: str, value: NDArray) -> float:
+    """The number in an array of one.
+
+    Raises:
+        ValueError: It is not one positive number.
+    """
+    if value.size != 1 or value.dtype.kind not in "fiu" or not value.item() > 0:
+        raise ValueError(f"{path}: {name}: expected one positive number, got {value}")
+    return float(value.item())
 
 
 def check_offsets(path: Path | str, offsets: NDArray, rows: int) -> None:

@@ -1,12 +1,14 @@
 """What a data set is: recordings of a moving block, split for training and testing, and windows cut from them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lcplearn.datasets.files import positive_number, read_npz
 from lcplearn.formulations.losses import Windows
 
 
@@ -54,6 +56,45 @@ class BlockData:
     gravity: float
     mass: float | None
     mu: float | None
+
+
+def read_recordings(path: Path | str, *, gravity: float = 9.81) -> BlockData:
+    """Recordings of one's own, all of them in each part: to score a model that is trained.
+
+    Args:
+        path: NPZ file with dt and the arrays of `Recordings`, of which friction, steps and true_velocities may be
+            missing; it may have the true mu and mass.
+        gravity: Gravitational acceleration [m/s^2].
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It lacks an array, or one has another shape or kind than it should.
+    """
+    needed, known = ("positions", "velocities", "forces"), ("mu", "mass")
+    arrays = read_npz(path, (*needed, "dt"), optional=("friction", "steps", "true_velocities", *known))
+    if arrays["forces"].ndim != 2 or arrays["forces"].size == 0:
+        raise ValueError(f"{path}: forces: expected shape [N, T], got {list(arrays['forces'].shape)}")
+    count, steps = arrays["forces"].shape
+    shapes: dict[str, tuple[int, ...]] = {"forces": (count, steps), "friction": (count, steps, 2), "steps": (count,)}
+    shapes |= dict.fromkeys(("positions", "velocities", "true_velocities"), (count, steps + 1))
+    fields: dict[str, Tensor | None] = dict.fromkeys(Recordings._fields)
+    fields["steps"] = torch.full((count,), steps)
+    for name, shape in shapes.items():
+        if name not in arrays:
+            continue
+        array, kinds = arrays[name], "iu" if name == "steps" else "fiu"
+        if array.shape != shape or array.dtype.kind not in kinds:
+            what = "integers" if name == "steps" else "numbers"
+            raise ValueError(
+                f"{path}: {name}: expected {what} of shape {list(shape)}, got {array.dtype} {list(array.shape)}"
+            )
+        fields[name] = torch.as_tensor(array, dtype=torch.int64 if name == "steps" else torch.float64)
+    everything = Recordings(**fields)  # type: ignore[arg-type]  # those that are needed are there
+    if not bool(((everything.steps >= 1) & (everything.steps <= steps)).all()):
+        raise ValueError(f"{path}: steps: expected numbers from 1 to {steps}")
+    truth = {name: positive_number(path, name, arrays[name]) if name in arrays else None for name in known}
+    dt = positive_number(path, "dt", arrays["dt"])
+    return BlockData("sliding_block", everything, everything, everything, everything, dt, gravity, **truth)
 
 
 def windows(recordings: Recordings, k: int | None = None) -> Windows:

@@ -16,6 +16,7 @@ import yaml
 # As in formulations/losses.py, which imports torch; a test compares them.
 LOSS_TERMS = ("prediction", "rollout", "complementarity", "nonnegativity", "violation")
 TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
+FROM_DATA = {"dt", "gravity"}  # of a model, which takes them from its data
 TYPES = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,), "None": (type(None),), "Path": (str,)}
 
 
@@ -40,6 +41,8 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) ->
         _check_type(key, settings.get(key), kind)
     if settings["threads"] < 1:
         raise SettingsError(f"threads must be at least 1, got {settings['threads']}.")
+    if not 0 <= settings["seed"] < 2**32:  # what NumPy's generator takes
+        raise SettingsError(f"seed must be at least 0 and below 2^32, got {settings['seed']}.")
     _check_friction(settings)
     for group in ("data", "model", "optimizer", "logger"):
         if settings[group] or group != "logger":  # logger=none is empty
@@ -48,9 +51,10 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) ->
         raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
     _check_loss(settings["loss"])
     _check_arguments("trainer", settings["trainer"], TRAINER)
-    epochs = settings["trainer"]["max_epochs"]
-    if epochs is None or epochs < 1:
-        raise SettingsError(f"trainer.max_epochs must be at least 1, got {epochs}.")
+    for key in ("max_epochs", "check_val_every_n_epoch"):
+        epochs = settings["trainer"].get(key, 1)
+        if epochs is None or epochs < 1:
+            raise SettingsError(f"trainer.{key} must be at least 1, got {epochs}.")
     strategy = str(settings["trainer"].get("strategy", "auto"))
     if multirun and strategy.startswith("ddp") and not strategy.startswith(("ddp_fork", "ddp_spawn")):
         raise SettingsError(f"A sweep (-m) can't run with trainer.strategy={strategy}: use trainer.strategy=ddp_fork.")
@@ -100,6 +104,7 @@ def _check_arguments(group: str, arguments: Mapping[str, Any], target: str) -> N
     accepted = signature(target)
     if accepted is None:  # not written in Python, or re-exported: the call itself will tell
         return
+    accepted = {name: kind for name, kind in accepted.items() if group != "model" or name not in FROM_DATA}
     for key, value in arguments.items():
         if "**" not in accepted:
             _known(key, accepted, "setting", prefix=f"{group}.")
@@ -201,4 +206,5 @@ def _vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:
         return in_files | {folder.name for folder in conf.iterdir() if folder.is_dir()}, set()
     targets = {content["_target_"] for content in contents if "_target_" in content}
     targets |= {TRAINER} if group == "trainer" else set()
-    return in_files, {name for target in targets for name in signature(target) or {}} - {"**", "dt", "gravity"}
+    in_code = {name for target in targets for name in signature(target) or {}} - {"**"}
+    return in_files, in_code - FROM_DATA if group == "model" else in_code

@@ -75,6 +75,9 @@ def test_the_loss_terms_known_without_torch_are_those_of_the_losses() -> None:
         ("loss.horizon=0", "loss.horizon must be at least 1, got 0."),
         ("batch_size=64", "LBFGS needs the full batch: set batch_size=null, or optimizer=adam."),
         ("trainer.max_epochs=0", "trainer.max_epochs must be at least 1, got 0."),
+        ("trainer.check_val_every_n_epoch=null", "trainer.check_val_every_n_epoch must be at least 1, got None."),
+        ("seed=-1", "seed must be at least 0 and below 2^32, got -1."),
+        ("+model.dt=0.1", "Unknown setting 'model.dt'"),
         ("seed=true", "seed must be int, got True."),
         ("threads=0", "threads must be at least 1, got 0."),
         ("ckpt_path=nope.ckpt", "ckpt_path=nope.ckpt is not a file; checkpoints are named runs/DATE_TIME/last.ckpt."),
@@ -108,6 +111,7 @@ def test_a_sweep_refuses_the_strategy_that_would_start_it_twice() -> None:
     [
         ("modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
         ("model=mpl", "There is no model=mpl; did you mean 'mlp'?"),
+        ("data.gravity=1.62", "'data.gravity' is not set in conf/data; to add it, write +data.gravity=..."),
         ("model.widht=3", "Unknown setting 'model.widht'; did you mean 'model.width'?"),
         ("trainer.max_epoch=3", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),
         (

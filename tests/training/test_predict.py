@@ -11,7 +11,9 @@ from training.helpers import short_fit, tiny_data
 
 import lcplearn
 from lcplearn import predict
-from lcplearn.formulations import Direct, Structured
+from lcplearn.datasets.cube_slides import COLUMNS
+from lcplearn.formulations import Direct, Physical, Structured
+from lcplearn.training.metrics import evaluate
 
 FORCES = [0.0, 3.0, 12.0, -9.0, -9.0, 0.5, 0.0]
 
@@ -93,6 +95,7 @@ def test_scoring_the_test_recordings_gives_the_figures_of_the_run(checkpoint: Pa
         ("force", ["1.0", "x"], "line 3: force must be a number, got 'x'"),
         ("force", ["1.0", "nan"], "forces must be finite numbers"),
         ("force", [""], "forces must have at least one step"),
+        ("force,friction_plus,friction_minus", ["1.0,2.0"], "line 2: friction_minus must be a number, got None"),
     ],
 )
 def test_a_wrong_input_file_gets_one_sentence(
@@ -102,6 +105,46 @@ def test_a_wrong_input_file_gets_one_sentence(
         predict.main([str(checkpoint), "--input", str(forces_csv(tmp_path, header, rows))])
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_csv_file_as_spreadsheets_write_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "forces.csv"
+    path.write_bytes("\ufeffforce\r\n1.5\r\n".encode())
+    assert predict.read_inputs(path).forces.tolist() == [[1.5]]
+    path.write_bytes(b"PK\x03\x04\xff\xfe")
+    with pytest.raises(ValueError, match="is not a CSV file"):
+        predict.read_inputs(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"forces": np.zeros((2, 0))}, "forces must have at least one step"),
+        ({"forces": np.array(["a"])}, "forces must be numbers, got text"),
+        ({"forces": np.array([{}])}, "pickles"),
+        ({"state": np.zeros((5, 2))}, r"state must have shape \[3, 2\] or \[2\], got \[5, 2\]"),
+        ({"friction": np.zeros((3, 4))}, r"friction must have shape \[3, 4, 2\]"),
+    ],
+)
+def test_a_wrong_npz_input_gets_one_sentence(changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", **({"forces": np.zeros((3, 4))} | changes))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=message) as error:
+        predict.read_inputs(tmp_path / "in.npz")
+    assert "\n" not in str(error.value)
+
+
+def test_scoring_slides_scores_every_one_of_them(tmp_path: Path) -> None:
+    """Two slides of one and two steps that lose no velocity: the model stops mu g dt^2 and 3 mu g dt^2 too early."""
+    rows = np.zeros((5, len(COLUMNS)))
+    rows[:, COLUMNS.index("s_m")] = [0.0, 0.1, 0.0, 0.1, 0.2]
+    rows[:, COLUMNS.index("v_m_s")] = 2.0
+    np.savez(tmp_path / "slides.npz", data=rows, offsets=np.array([0, 2, 5]), columns=np.array(COLUMNS), dt=0.05,
+             g=9.81, mass_kg=0.37)  # fmt: skip
+    model = Physical(dt=0.05, initial_mu=0.1)
+    data = predict.read_data(tmp_path / "slides.npz", model)
+    assert data.test.steps.tolist() == [1, 2]
+    median = (1 + 3) / 2 * 0.1 * 9.81 * 0.05**2 * 1e3
+    assert evaluate(model, data)["stop_error_median_mm"] == pytest.approx(median)
 
 
 def test_files_that_are_no_checkpoint_or_no_data_get_one_sentence(checkpoint: Path, tmp_path: Path) -> None:
@@ -115,7 +158,14 @@ def test_files_that_are_no_checkpoint_or_no_data_get_one_sentence(checkpoint: Pa
         ([str(checkpoint), "--input", "nope.csv"], "There is no input file nope.csv"),
         ([str(checkpoint), "--input", str(checkpoint)], "must end in .csv or .npz"),
         ([str(checkpoint), "--score", str(tmp_path / "other.npz")], "has time steps of 0.1 s"),
-        ([str(checkpoint), "--score", str(tmp_path / "short.npz")], "lacks dt, positions, velocities"),
+        ([str(checkpoint), "--score", str(tmp_path / "short.npz")], "positions, velocities, dt missing; got forces"),
+        ([str(checkpoint), "--score", str(text)], "expected an NPZ file"),
+        ([str(checkpoint), "--score", "nope.npz"], "nope.npz: no such file"),
+        (
+            [str(checkpoint), "--input", str(text), "--state", "0", "nan"],
+            "state: expected finite position and velocity",
+        ),
+        ([str(checkpoint), "--input", str(text), "--output", str(tmp_path / "none" / "a.csv")], "No such file"),
     ]
     for arguments, message in cases:
         with pytest.raises(SystemExit, match=message):
