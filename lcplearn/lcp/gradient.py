@@ -131,11 +131,12 @@ def adjoint(
     M, z, w, grad_z, grad_w = (x.double() for x in (M, z, w, grad_z, grad_w))
     solved = (status == Status.SOLVED).unsqueeze(-1)
     g_z, g_w, z = (torch.where(solved, x, 0.0) for x in (grad_z, grad_w, z))
+    if options.smoothing:
+        basis, damping = _damping(z, w, basis & solved)
     h_I = torch.where(basis, 0.0, g_w)
     rhs = -g_z - (M.mT @ h_I.unsqueeze(-1)).squeeze(-1)
     K = M.mT
     if options.smoothing:
-        damping = _damping(z, w, solved)
         K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
     grad_q = torch.where(basis, _solve_on_basis(K, basis & solved, rhs, dtype, options), h_I)
     grad_M = (grad_q.unsqueeze(-1) * z.unsqueeze(-2)).sum_to_size(M.shape).to(dtype) if need_M else None
@@ -178,7 +179,10 @@ def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, opt
     e = torch.zeros_like(z) if dq is None else torch.where(solved, dq.double(), 0.0)
     if dM is not None:
         e = e + torch.where(solved, (dM.double() @ z.unsqueeze(-1)).squeeze(-1), 0.0)
-    K = M + torch.diag_embed(_damping(z, w, solved)) if options.smoothing else M
+    K = M
+    if options.smoothing:
+        basis, damping = _damping(z, w, basis & solved)
+        K = M + torch.diag_embed(damping)
     dz = _solve_on_basis(K, basis & solved, -e, dtype, options)
     dw = e + (M @ dz.unsqueeze(-1)).squeeze(-1)
     if not options.smoothing:
@@ -186,9 +190,11 @@ def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, opt
     return dz.to(dtype), torch.where(solved, dw, 0.0).to(dtype)
 
 
-def _damping(z: Tensor, w: Tensor, solved: Tensor) -> Tensor:
-    """The diagonal w / z that smoothing adds."""
-    return torch.where(solved, w, 0.0) / torch.where(solved, z, 1.0)
+def _damping(z: Tensor, w: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """The diagonal w / z that smoothing adds, and where it is finite: a member with z = 0 is nonbasic in the limit."""
+    quotient = torch.where(basis, w, 0.0) / torch.where(basis, z, 1.0)
+    basis = basis & quotient.isfinite()
+    return basis, torch.where(basis, w, 0.0) / torch.where(basis, z, 1.0)
 
 
 def _solve_on_basis(K: Tensor, basis: Tensor, rhs: Tensor, dtype: torch.dtype, options: Options) -> Tensor:
@@ -245,7 +251,9 @@ def _solve_block(K: Tensor, basis: Tensor, rhs: Tensor, pivot_tolerance: float, 
     singular = ~(diagonal.amin(-1) > n * pivot_tolerance)
     x = torch.linalg.lu_solve(factors, pivots, b).squeeze(-1)
     if singular.any():
-        least_squares = torch.linalg.pinv(block[singular], rtol=rank_tolerance) @ b[singular]
+        finite = block[singular].isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+        rest = torch.where(finite, block[singular], 0.0)  # pinv would raise, for the whole batch
+        least_squares = torch.linalg.pinv(rest, rtol=rank_tolerance) @ b[singular]
         x[singular] = least_squares.squeeze(-1)
     return torch.where(basis, columns * x, 0.0)
 

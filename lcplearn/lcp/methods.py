@@ -14,6 +14,8 @@ from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, interior_poin
 from lcplearn.lcp.residuals import judge
 from lcplearn.lcp.solution import LCPSolution, Status
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
 Method = Literal["auto", "diagonal", "pivoting", "interior_point"]
 
 
@@ -83,7 +85,10 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
     )
     z, w, basis, residual, status, iterations, certificate = result
     if single:
-        z, w, certificate = z.astype(np.float32), w.astype(np.float32), certificate.astype(np.float32)
+        overflow = (status == 0) & (np.maximum(z, w) > FLOAT32_MAX).any(-1)
+        status[overflow], residual[overflow] = Status.UNSOLVED, np.inf
+        z, w = (x.clip(-FLOAT32_MAX, FLOAT32_MAX).astype(np.float32) for x in (z, w))
+        certificate = certificate.astype(np.float32)
     if len(batch) != 1:
         z, w, basis, certificate = z.reshape(shape), w.reshape(shape), basis.reshape(shape), certificate.reshape(shape)
         status, residual, iterations = status.reshape(batch), residual.reshape(batch), iterations.reshape(batch)
@@ -149,18 +154,21 @@ def _largest(x: Tensor) -> Tensor:
 
 
 def _pack(q: Tensor, end: Iterate, finite: Tensor, residual: Tensor, solved: Tensor) -> LCPSolution:
-    """The solution in the shape and type of q, with the status of each element."""
-    status = torch.where(end.exhausted, Status.MAX_ITERATIONS.value, Status.UNSOLVED.value)
-    status = torch.where(solved, Status.SOLVED.value, status)
-    status = torch.where(finite, status, Status.NONFINITE_INPUT.value)
+    """The solution in the shape and type of q, with the status of each element; none that overflows is SOLVED."""
     nan = torch.where(finite, 0.0, torch.nan).unsqueeze(-1)
+    limit = torch.finfo(q.dtype).max
+    z, w = ((x.clamp(-limit, limit) + nan).to(q.dtype) for x in (end.z, end.w))
+    in_range = finite & (torch.maximum(end.z, end.w) <= limit).all(-1)
+    status = torch.where(end.exhausted, Status.MAX_ITERATIONS.value, Status.UNSOLVED.value)
+    status = torch.where(solved & in_range, Status.SOLVED.value, status)
+    status = torch.where(finite, status, Status.NONFINITE_INPUT.value)
     batch = q.shape[:-1]
     return LCPSolution(
-        z=(end.z + nan).to(q.dtype).reshape(q.shape),
-        w=(end.w + nan).to(q.dtype).reshape(q.shape),
+        z=z.reshape(q.shape),
+        w=w.reshape(q.shape),
         basis=end.basis.reshape(q.shape),
         status=status.reshape(batch),
-        residual=torch.where(finite, residual.nan_to_num(torch.inf), torch.inf).reshape(batch),
+        residual=torch.where(in_range, residual.nan_to_num(torch.inf), torch.inf).reshape(batch),
         iterations=end.iterations.reshape(batch),
         certificate=torch.zeros_like(q),
     )

@@ -267,3 +267,24 @@ def test_gradient_at_a_kink_is_that_of_one_of_its_two_sides(method):
     distance = torch.stack([(slope - side).abs() for side in sides])
     assert distance.amin(0).max() < 1e-6
     assert distance.amax(0).max() > 1e-3  # the sides do differ
+
+
+def test_smoothed_gradient_is_finite_where_a_member_of_the_central_path_rounds_to_zero():
+    """w / z is infinite there: the member counts as nonbasic, as it is in the limit."""
+    q = torch.tensor([1e30, -1.0]).float().requires_grad_()
+    solution = solve_lcp(torch.eye(2).float(), q, smoothing=1e-30)
+    assert solution.z[0] == 0
+    (solution.z.sum() + solution.w[0]).backward()
+    torch.testing.assert_close(q.grad, torch.tensor([1.0, -1.0]).float())
+
+
+def test_blocks_that_are_not_finite_spoil_no_neighbour():
+    M, q = problem("positive definite", batch=2)
+    with torch.no_grad():
+        M[0] *= 1e300
+    z = solve_lcp(M, q, method="interior_point").z
+    (gradient,) = torch.autograd.grad(z.square().sum(), q)
+    alone = q[1].detach().requires_grad_()
+    (expected,) = torch.autograd.grad(solve_lcp(M[1], alone, method="interior_point").z.square().sum(), alone)
+    assert gradient.isfinite().all()
+    torch.testing.assert_close(gradient[1], expected)

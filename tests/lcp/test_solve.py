@@ -109,7 +109,7 @@ def test_diagonal_problem_is_judged_in_closed_form_as_by_the_general_judge(pairs
     solution = solve_lcp(torch.diag(d), q, method="diagonal")
     judgement = judge(torch.diag(d), q, solution.z, tol=1e-10)
     assert solution.solved == (judgement.residual <= judgement.tolerance)
-    assert solution.solved == bool(((q >= 0) | (d > 0)).all()) or not solution.z.isfinite().all()
+    assert solution.solved == bool(((q >= 0) | ((d > 0) & (q / d).isfinite())).all())  # 1e300 / 1e-12 is out of range
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -285,3 +285,13 @@ def test_w_is_not_zeroed_with_a_member_that_leaves_the_basis(method):
     solution = solve_lcp(M, q, method=method)
     torch.testing.assert_close(solution.w, torch.tensor([0.0, q[1]]), rtol=1e-14, atol=0)
     assert solution.basis.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("method", ["diagonal", *METHODS])
+def test_a_solution_beyond_the_range_of_the_callers_type_is_not_solved(method):
+    M, q = torch.tensor([[1e-30], [1.0]]).float().unsqueeze(-1), torch.tensor([[-1e30], [-1.0]]).float()
+    solution = solve_lcp(M, q.requires_grad_(), method=method)
+    assert solution.solved.tolist() == [False, True]
+    assert solution.residual.tolist() == [torch.inf, 0.0]
+    solution.z.sum().backward()
+    assert q.grad.flatten().tolist() == [0.0, -1.0]
