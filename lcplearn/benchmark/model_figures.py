@@ -83,7 +83,7 @@ def _decades(ax: "Axes", values: Sequence[float]) -> None:
     ax.set_xscale("log")
     ax.xaxis.set_minor_formatter(NullFormatter())
     if len(finite):
-        ax.set_xlim(10 ** np.floor(finite.min()), 10 ** (np.floor(finite.max()) + 1))
+        ax.set_xlim(10 ** np.floor(finite.min()), min(10 ** (np.floor(finite.max()) + 1), 1e6))
 
 
 def _quantity_axis(ax: "Axes", quantity: str) -> None:
@@ -127,7 +127,7 @@ def real_beside_simulated(slides: Sequence[Row], simulated: Sequence[Row]) -> "F
     learned_from = [row for row in slides if row["size"] == 40]
     noisy = [row for row in simulated if row["noise"] == 0.01]
     names = list(dict.fromkeys(str(row["model"]) for row in learned_from))
-    figure, axes = new_figure(1, 2, width=7.5, height=1.6 + 0.3 * len(names))
+    figure, axes = new_figure(1, 2, width=7.5, height=1.2 + 0.45 * len(names))
     left, right = axes[0]
     for ax, rows, column in ((left, learned_from, "stop_error_median_mm"), (right, noisy, "rollout_rmse_100")):
         for at, name in enumerate(names):
@@ -136,13 +136,12 @@ def real_beside_simulated(slides: Sequence[Row], simulated: Sequence[Row]) -> "F
                 middle, low, high = summary(own, column)
                 dots = look(name) | {"linestyle": "none"}
                 ax.errorbar([middle], [at], xerr=[[middle - low], [high - middle]], markersize=7, **dots)
-        ax.set_yticks(range(len(names)), names if ax is left else [])
         ax.set_ylim(len(names) - 0.5, -0.5)
-        ax.set_xscale("log")
-    for at, name in enumerate(names):
-        rest = median([row for row in learned_from if row["model"] == name], "rest_share")
-        left.annotate(f"at rest: {rest:.0%} ", (1, at), xycoords=("axes fraction", "data"), ha="right", fontsize=8)
-    left.set_xlim(right=4 * left.get_xlim()[1])
+        _decades(ax, [float(row[column]) for row in rows if row["model"] in names])
+    at_rest = [median([row for row in learned_from if row["model"] == name], "rest_share") for name in names]
+    labels = [f"{name}\n{share:.0%} at rest" for name, share in zip(names, at_rest, strict=True)]
+    left.set_yticks(range(len(names)), labels, fontsize=9)
+    right.set_yticks(range(len(names)), [])
     left.set_xlabel("median error of where a slide stops [mm]", fontsize=9)
     right.set_xlabel(QUANTITIES["rollout_rmse_100"], fontsize=9)
     left.set_title("real slides of a cube", fontsize=10)

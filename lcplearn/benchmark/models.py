@@ -70,7 +70,9 @@ def plan(options: Options, *, slides: bool) -> Iterable[tuple[Any, ...]]:
 
 def _quick(seed: int, slides: bool) -> Iterable[tuple[Any, ...]]:
     for model, noise, steps in product(QUICK_MODELS, NOISES[:2], (100, 1000)):
-        if model != "mlp" or (noise == 0.01 and steps == 1000):  # its training takes 10 times as long
+        if steps == 1000 or noise == 0.01:
+            if model == "mlp" and (noise == 0 or steps == 100):  # its training takes 10 times as long
+                continue
             yield "simulated", model, noise, steps, seed
     if slides:
         yield from (("slides", model, "", 40, seed) for model in ("affine", "physical"))
