@@ -37,7 +37,7 @@ def run(options: Options) -> None:
     for key in study.remaining(plan(options.quick), seconds=expected_seconds):
         part, scene, formulation, dt, batch = key
         if part == "step":
-            row = step_row(str(scene), str(formulation), float(dt), int(batch), 5 if options.quick else 21)
+            row = step_row(str(scene), str(formulation), float(dt), int(batch), 15 if options.quick else 51)
         else:
             row = motion_row(str(scene), str(formulation), float(dt), 1 if options.quick else 5)
         study.add(key, BLANK | row)

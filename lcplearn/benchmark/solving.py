@@ -11,12 +11,14 @@ from lcplearn.lcp.residuals import default_tolerance, judge
 from lcplearn.lcp.solution import Status
 from lcplearn.lcp.solve import solve_lcp
 
-OURS: dict[str, tuple[Any, torch.dtype]] = {
-    "pivoting": ("pivoting", torch.float64),
-    "interior_point": ("interior_point", torch.float64),
-    "diagonal": ("diagonal", torch.float64),
-    "pivoting float32": ("pivoting", torch.float32),
-    "interior_point float32": ("interior_point", torch.float32),
+SMOOTHED = "smoothed 1e-8"  # z_i w_i = 1e-8: biased on purpose, judged as the problem that it is
+OURS: dict[str, tuple[dict[str, Any], torch.dtype]] = {
+    "pivoting": ({"method": "pivoting"}, torch.float64),
+    "interior_point": ({"method": "interior_point"}, torch.float64),
+    SMOOTHED: ({"smoothing": 1e-8}, torch.float64),
+    "diagonal": ({"method": "diagonal"}, torch.float64),
+    "pivoting float32": ({"method": "pivoting"}, torch.float32),
+    "interior_point float32": ({"method": "interior_point"}, torch.float32),
 }
 
 
@@ -25,7 +27,7 @@ class Answer(NamedTuple):
 
     Attributes:
         z: [B, n], float64.
-        statuses: Names of `Status` values, of which a peer knows SOLVED and UNSOLVED.
+        statuses: Names of `Status` values, of which a peer knows SOLVED and UNSOLVED; or RAISED and an error's name.
         residual, tolerance: Ours, recomputed from z as it came back, and what it is held against: [B].
     """
 
@@ -39,26 +41,39 @@ METHODS: tuple[str, ...] = (*OURS, *peers())
 
 
 def solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
-    """Solve B problems M [B, n, n], q [B, n] by one of `METHODS`; None if it doesn't apply."""
+    """Solve B problems M [B, n, n], q [B, n] by one of `METHODS`; None if it doesn't apply.
+
+    What raises has the status "RAISED" with the error's name: no numbers should make a solver do that.
+    """
+    try:
+        return _solve(method, M, q)
+    except (ArithmeticError, IndexError, RuntimeError, ValueError, np.linalg.LinAlgError) as error:
+        bad = np.full(len(q), np.inf)
+        return Answer(np.full(q.shape, np.nan), [f"RAISED {type(error).__name__}"] * len(q), bad, 0 * q[:, :0].sum(-1))
+
+
+def _solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
     if method in peers():
         if q.shape[1] == 0:
             return None
         found = peers()[method](M, q)
         return _judged(M, q, found.z, ["SOLVED" if claim else "UNSOLVED" for claim in found.claimed], torch.float64)
-    name, dtype = OURS[method]
-    if name == "diagonal" and np.where(np.eye(M.shape[-1]) == 1, 0, M).any():
+    keywords, dtype = OURS[method]
+    if method == "diagonal" and np.where(np.eye(M.shape[-1]) == 1, 0, M).any():
         return None
     with np.errstate(over="ignore"):
         data = [torch.from_numpy(np.ascontiguousarray(x)).to(dtype) for x in (M, q)]
-    solution = solve_lcp(*data, method=name)
+    solution = solve_lcp(*data, **keywords)
     statuses = [Status(value).name for value in solution.status.tolist()]
     M, q, z = (x.double().numpy() for x in (*data, solution.z))
-    return _judged(M, q, z, statuses, dtype)
+    return _judged(M, q, z, statuses, dtype, keywords.get("smoothing", 0.0))
 
 
-def _judged(M: np.ndarray, q: np.ndarray, z: np.ndarray, statuses: list[str], dtype: torch.dtype) -> Answer:
+def _judged(
+    M: np.ndarray, q: np.ndarray, z: np.ndarray, statuses: list[str], dtype: torch.dtype, smoothing: float = 0.0
+) -> Answer:
     tensors = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M, q, z))
-    residual, tolerance = (x.numpy() for x in judge(*tensors, tol=default_tolerance(dtype)))
+    residual, tolerance = (x.numpy() for x in judge(*tensors, tol=default_tolerance(dtype), smoothing=smoothing))
     if dtype == torch.float32 and q.shape[-1]:
         # what rounding of z to the caller's float32 costs, however well it was solved
         with np.errstate(invalid="ignore"):
@@ -85,8 +100,8 @@ def gradient_error(method: str, M: np.ndarray, q: np.ndarray, read: np.ndarray |
     """
     if method not in OURS or len(q) == 0 or (read is None and not symmetric):
         return float("nan")
-    name, dtype = OURS[method]
-    start = solve_lcp(torch.from_numpy(np.array(M)), torch.from_numpy(np.array(q)), method=name)
+    keywords, dtype = OURS[method]
+    start = solve_lcp(torch.from_numpy(np.array(M)), torch.from_numpy(np.array(q)), **keywords)
     z, w = start.z.numpy(), start.w.numpy()
     rng = np.random.default_rng(0)
     s = float(rng.standard_normal())
@@ -100,7 +115,7 @@ def gradient_error(method: str, M: np.ndarray, q: np.ndarray, read: np.ndarray |
     readout = torch.from_numpy(rng.standard_normal(len(unique)) / sizes)
 
     def value(M: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        solution = solve_lcp(M, q, method=name)
+        solution = solve_lcp(M, q, **keywords)
         if read is None:
             return readout @ solution.w.double()
         return readout @ (torch.from_numpy(read) @ solution.z.double())

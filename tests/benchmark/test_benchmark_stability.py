@@ -97,6 +97,16 @@ def test_a_false_claim_is_wrong_an_honest_failure_gives_up_and_a_bad_value_is_in
     assert stability.verdict(unsolvable, answer, float("nan"), True, "pivoting") == "wrong"
 
 
+def test_a_solver_that_raises_is_wrong(monkeypatch):
+    def broken(*_, **__):
+        raise IndexError("no such row")
+
+    monkeypatch.setattr("lcplearn.benchmark.solving.solve_lcp", broken)
+    row = stability.case_row(CASES[0], "pivoting")
+    assert row["status"] == "RAISED IndexError"
+    assert row["verdict"] == "wrong"
+
+
 def test_the_gradient_check_finds_a_wrong_gradient(monkeypatch):
     M, q = np.array([[2.0, 1.0], [0.0, 3.0]]), np.array([-1.0, -2.0])
     assert gradient_error("pivoting", M, q, np.eye(2), False) < 1e-5
