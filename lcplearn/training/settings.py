@@ -63,12 +63,15 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) ->
 
 def _check_friction(settings: Mapping[str, Any]) -> None:
     """Models of known friction learn from labels that only simulations have."""
-    model, data = (str(settings[group].get("_target_")).rpartition(".")[2] for group in ("model", "data"))
-    if model in ("Direct", "Slack") and not settings["data"].get("friction"):
+    model = str(settings["model"].get("_target_")).rpartition(".")[2]
+    if model not in ("Direct", "Slack"):
+        return
+    accepted = signature(str(settings["data"].get("_target_")))
+    if accepted is not None and "friction" not in accepted:
+        raise SettingsError(f"model={model.lower()} needs friction labels, which only data=sliding_block has.")
+    if not settings["data"].get("friction"):
         kinds = "slack" if model == "Slack" else "physical or data.friction=lcp"
         raise SettingsError(f"model={model.lower()} needs friction labels: set data.friction={kinds}.")
-    if "friction" in settings["data"] and not data.startswith("simulate_"):
-        raise SettingsError(f"model={model.lower()} needs friction labels, which only data=sliding_block has.")
 
 
 def _check_loss(loss: Mapping[str, Any]) -> None:

@@ -82,6 +82,7 @@ def test_the_loss_terms_known_without_torch_are_those_of_the_losses() -> None:
         ("threads=0", "threads must be at least 1, got 0."),
         ("ckpt_path=nope.ckpt", "ckpt_path=nope.ckpt is not a file; checkpoints are named runs/DATE_TIME/last.ckpt."),
         ("model=direct data.friction=null", "model=direct needs friction labels: set data.friction=physical"),
+        ("data=cube_slides +data.friction=slack", "Unknown setting 'data.friction'"),
         ("data=cube_slides model=slack", "model=slack needs friction labels, which only data=sliding_block has."),
     ],
 )
