@@ -98,7 +98,7 @@ def _check_solution(method: str, batch: Batch, solution: LCPSolution) -> list[Fi
         elif not finite:
             continue
         elif not np.isfinite([z, w]).all():
-            if status == Status.SOLVED or _within(M, q, HUGE):
+            if status == Status.SOLVED or _within(M, q, HUGE_FLOAT32 if M.dtype == np.float32 else HUGE):
                 wrong = "not finite", f"status {name} with z={z}, w={w}"
         elif (z < 0).any():
             wrong = "sign", f"z={z}"
@@ -116,8 +116,8 @@ def _wrong_solution(
 ) -> tuple[str, str] | None:
     if (z[~basis] != 0).any() or (w[basis] != 0).any():
         return "basis", f"basis={basis} with z={z}, w={w}"
-    largest = np.abs(M).astype(np.longdouble) @ z
-    ratio = float(largest.max() / max(np.abs(q).max(), TINY))
+    with np.errstate(all="ignore"):
+        ratio = float((np.abs(M).astype(np.longdouble) @ z).max() / max(np.abs(q).max(), TINY))
     if M.dtype == np.float32:
         if not _within(M, q, HUGE_FLOAT32):
             return None
