@@ -74,7 +74,7 @@ class Study:
             self._check_settings()
             _drop_torn_line(self.path)
             self.rows = read_rows(self.path)
-            self._append("".join(f"# continued {line}\n" for line in ("", *provenance())))
+            self._append("".join(f"# continued, {line}\n" for line in provenance()))
         else:
             self.rows = []
             lines = (f"settings: {self._settings}", *provenance())
