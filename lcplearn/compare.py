@@ -164,7 +164,7 @@ def _read(path: Path, parse: Any) -> dict[str, Any]:
     try:
         values = parse(path.read_text())
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"{path} can't be read: {error}") from None
+        raise ValueError(f"{path} can't be read: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise ValueError(f"{path} holds no settings or figures.")
     return values
@@ -173,19 +173,26 @@ def _read(path: Path, parse: Any) -> dict[str, Any]:
 def _labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Name of the model's class, and whatever else differs."""
     flat = [_flatten(config) for config in configs]
-    models = [str(config.get("model._target_", "?")).rpartition(".")[2] for config in flat]
+    names = {group: [_class_name(config, group) for config in flat] for group in ("model", "data")}
     labels = []
-    for config, model in zip(flat, models, strict=True):
-        parts = [model]
+    for config, model, data in zip(flat, names["model"], names["data"], strict=True):
+        parts = [model, *([f"data={data}"] if len(set(names["data"])) > 1 else [])]
         for key in sorted({key for other in flat for key in other}):
-            if key.startswith(_SILENT) or key == "model._target_":
+            if key.startswith(_SILENT) or key in ("model._target_", "data._target_"):
                 continue
-            own = key.startswith(("model.", "data.friction"))  # what a model brings along is no difference to others
-            values = [other.get(key) for other, name in zip(flat, models, strict=True) if name == model or not own]
+            # What a model or a data set brings along is no difference to others.
+            owner = "model" if key.startswith("data.friction") else key.partition(".")[0]
+            owners = names.get(owner, names["model"])
+            mine = {"model": model, "data": data}.get(owner)
+            values = [other.get(key) for other, name in zip(flat, owners, strict=True) if mine in (None, name)]
             if any(value != values[0] for value in values):
                 parts.append(f"{key}={config.get(key)}")
         labels.append(" ".join(parts))
     return labels
+
+
+def _class_name(config: Mapping[str, Any], group: str) -> str:
+    return str(config.get(f"{group}._target_", "?")).rpartition(".")[2]
 
 
 def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

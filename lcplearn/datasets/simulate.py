@@ -13,7 +13,7 @@ from lcplearn.scenes.sliding_block import SlidingBlock
 FrictionLabels = Literal["physical", "lcp", "slack", "measured_slack"]
 
 _SPLITS = ("train", "validation", "test", "test_long")
-_FORCE_PER_LIMIT = 1.2  # standard deviation of the force over mu m g: the block rests 39-45 % of the time
+_FORCE_PER_LIMIT = 1.2  # standard deviation of the force over mu m g: the block rests 34-60 % of the time
 
 
 class _Draws(NamedTuple):

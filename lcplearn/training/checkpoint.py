@@ -31,7 +31,7 @@ def load(path: str | Path, map_location: str | torch.device | None = None) -> Fo
         The model, in evaluation mode.
 
     Raises:
-        ValueError: no such file, or not a checkpoint of lcplearn.
+        ValueError: no such file, not a checkpoint of lcplearn, or its class is missing or has changed.
     """
     checkpoint = read(path, map_location)
     module, _, name = checkpoint["formulation"]["class"].rpartition(".")
@@ -41,9 +41,13 @@ def load(path: str | Path, map_location: str | torch.device | None = None) -> Fo
         raise ValueError(f"{path} was made with the class {module}.{name}, which can't be imported here.") from error
     if not (isinstance(cls, type) and issubclass(cls, Formulation)):
         raise ValueError(f"{path} names the class {module}.{name}, which is not a Formulation.")
-    model = cls(**checkpoint["formulation"]["arguments"])
     state = {key.removeprefix(PREFIX): value for key, value in checkpoint["state_dict"].items()}
-    model.load_state_dict(state)
+    try:
+        model = cls(**checkpoint["formulation"]["arguments"])
+        model.load_state_dict(state)
+    except (TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path} was made with another version of {module}.{name}: {reason}") from error
     return model.to(map_location).eval() if map_location is not None else model.eval()
 
 

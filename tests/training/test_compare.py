@@ -35,6 +35,20 @@ def test_a_row_is_named_by_what_sets_it_apart(tmp_path: Path) -> None:
     assert [row.label for row in compare.read_runs([tmp_path])] == ["MLP loss.horizon=1", "MLP loss.horizon=10"]
 
 
+def test_settings_that_only_one_kind_of_data_has_set_no_other_apart(tmp_path: Path) -> None:
+    for name, settings in (("read_slides", {"path": None}), ("simulate", {"noise": 0.0, "mu": 0.4})):
+        run(tmp_path / name, "baselines.MLP", {"data": {"_target_": f"here.{name}", **settings}})
+    assert sorted(row.label for row in compare.read_runs([tmp_path])) == ["MLP data=read_slides", "MLP data=simulate"]
+
+
+def test_settings_that_are_no_yaml_get_one_sentence(tmp_path: Path) -> None:
+    run(tmp_path / "a", "baselines.MLP", velocity_rmse=0.5)
+    (tmp_path / "a" / "config.yaml").write_text("model: [")
+    with pytest.raises(SystemExit, match=r"config.yaml can't be read") as error:
+        compare.main([str(tmp_path)])
+    assert "\n" not in str(error.value)
+
+
 def test_the_table_holds_only_figures_that_a_run_has(tmp_path: Path) -> None:
     run(tmp_path / "a", "baselines.MLP", velocity_rmse=0.5, parameters=7)
     text = compare.format_table(compare.read_runs([tmp_path]))

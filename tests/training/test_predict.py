@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -178,3 +179,19 @@ def test_a_checkpoint_that_names_another_class_is_not_built(checkpoint: Path, tm
     torch.save(content, tmp_path / "odd.ckpt")
     with pytest.raises(ValueError, match="not a Formulation"):
         lcplearn.load(tmp_path / "odd.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [({"arguments": {"dt": 0.05, "mass": 1.0}}, "unexpected keyword argument 'mass'"),
+     ({"class": "lcplearn.formulations.relu.ReLU"}, "Missing key")],
+)  # fmt: skip
+def test_a_checkpoint_of_a_class_that_has_changed_says_so(
+    changed: dict[str, Any], reason: str, checkpoint: Path, tmp_path: Path
+) -> None:
+    content = torch.load(checkpoint)
+    content["formulation"] |= changed
+    torch.save(content, tmp_path / "old.ckpt")
+    with pytest.raises(ValueError, match=f"was made with another version of .*{reason}") as error:
+        lcplearn.load(tmp_path / "old.ckpt")
+    assert "\n" not in str(error.value)
