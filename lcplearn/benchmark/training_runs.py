@@ -10,6 +10,7 @@ from lcplearn.benchmark.modes import ModeData, Score, modes_from_forces, score
 from lcplearn.benchmark.study import Row
 from lcplearn.datasets import BlockData, read_cube_slides, simulate_sliding_block
 from lcplearn.formulations import FORMULATIONS, Formulation
+from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes import Mode
 from lcplearn.training import Optimizer, fit
 
@@ -72,6 +73,12 @@ SLIDES = {
     ),
     "physical": Settings(adam=60, loss="rollout", horizon=10, arguments={"learn_mass": False}),
 }
+
+
+def warm_up() -> None:
+    """Solve and differentiate one LCP, so that compiling the kernel is not counted as somebody's training."""
+    M = torch.eye(2, dtype=torch.float64, requires_grad=True)
+    solve_lcp(M, torch.tensor([-1.0, 1.0], dtype=torch.float64), method="pivoting").z.sum().backward()
 
 
 def simulated(steps: int, noise: float, seed: int, friction: Any = None) -> BlockData:
