@@ -124,8 +124,7 @@ def adjoint(
     M, z, w, basis, status = saved
     grad_z = torch.zeros_like(z) if grad_z is None else grad_z
     grad_w = torch.zeros_like(w) if grad_w is None else grad_w
-    scales = hasattr(pivoting_kernel(), "_equilibrate_rows_and_columns")  # TEMPORARY until pivoting.py is patched
-    if scales and pivots(z, options) and not _differentiated(z, grad_z, grad_w):
+    if pivots(z, options) and not _differentiated(z, grad_z, grad_w):
         return _adjoint_in_kernel(M, z, basis, status, grad_z, grad_w, need_M)
     dtype = z.dtype
     M, z, w, grad_z, grad_w = (x.double() for x in (M, z, w, grad_z, grad_w))
@@ -138,7 +137,7 @@ def adjoint(
     K = M.mT
     if options.smoothing:
         K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
-    grad_q = torch.where(basis, _solve_on_basis(K, basis & solved, rhs, dtype, options), h_I)
+    grad_q = torch.where(basis, _solve_on_basis(K, basis & solved, rhs, dtype), h_I)
     grad_M = (grad_q.unsqueeze(-1) * z.unsqueeze(-2)).sum_to_size(M.shape).to(dtype) if need_M else None
     return grad_M, grad_q.to(dtype)
 
@@ -183,7 +182,7 @@ def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, opt
     if options.smoothing:
         basis, damping = _damping(z, w, basis & solved)
         K = M + torch.diag_embed(damping)
-    dz = _solve_on_basis(K, basis & solved, -e, dtype, options)
+    dz = _solve_on_basis(K, basis & solved, -e, dtype)
     dw = e + (M @ dz.unsqueeze(-1)).squeeze(-1)
     if not options.smoothing:
         dw = torch.where(basis, 0.0, dw)
@@ -197,10 +196,8 @@ def _damping(z: Tensor, w: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     return basis, torch.where(basis, w, 0.0) / torch.where(basis, z, 1.0)
 
 
-def _solve_on_basis(K: Tensor, basis: Tensor, rhs: Tensor, dtype: torch.dtype, options: Options) -> Tensor:
+def _solve_on_basis(K: Tensor, basis: Tensor, rhs: Tensor, dtype: torch.dtype) -> Tensor:
     """x with K_AA x_A = rhs_A and x = 0 off the basis A; smallest least-squares solution where K_AA is singular."""
-    if options.method == "diagonal":
-        return torch.where(basis, rhs / torch.where(basis, K.diagonal(dim1=-2, dim2=-1), 1.0), 0.0)
     return _BasisSolve.apply(K, basis, rhs, RANK_TOLERANCES[dtype])
 
 

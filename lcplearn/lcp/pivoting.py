@@ -27,7 +27,8 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba.core import types
+from llvmlite import ir
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 RUIZ_SWEEPS = 4  # as in residuals.py
@@ -35,7 +36,8 @@ EPS = 2.220446049250313e-16
 SOLVED, INFEASIBLE, UNSOLVED, MAX_ITERATIONS, NONFINITE_INPUT = 0, 1, 2, 3, 4  # solution.Status, as plain constants
 DONE, STUCK, CAPPED = 0, 1, 2  # how a stage ended
 _EXPONENT = 0x7FF0000000000000  # bits of a double that remain when it is rounded down to a power of two
-_LARGEST = 1.7976931348623157e308
+LARGEST = 1.7976931348623157e308  # of all doubles
+TINY = 2.2250738585072014e-308  # the smallest double of full precision
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
@@ -110,7 +112,7 @@ def solve_batch(
     _announce_compilation()
     M, q = _plain(M), _plain(q)
     budget = -1 if max_iter is None else max_iter
-    floats, integers = np.empty(3 * n * n + 17 * n + 5), np.empty(8 * n + 2, dtype=np.int64)  # scratch
+    floats, integers = np.empty(3 * n * n + 19 * n + 16), np.empty(8 * n + 2, dtype=np.int64)  # scratch
     _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, floats, integers, *result)
     return result
 
@@ -123,6 +125,7 @@ def solve_adjoint(
     grad_w: np.ndarray,
     solved: np.ndarray,
     need_M: bool,
+    single_precision: bool = False,
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """Gradients of a scalar with respect to M and q from those with respect to z and w, at the basis A.
 
@@ -135,6 +138,7 @@ def solve_adjoint(
         z, grad_z, grad_w: float64 [B, n]; basis: bool [B, n].
         solved: bool [B]; the other elements get zero gradients.
         need_M: whether grad_M is wanted; else None is returned for it.
+        single_precision: the data were rounded to float32, so that pivots below 1e-7 n are noise.
 
     Returns:
         grad_M (or None) and grad_q [B, n]. Where M_AA is singular (redundant contacts, and the solver ended on an
@@ -145,8 +149,8 @@ def solve_adjoint(
     if grad_q.size:
         M, z, grad_z, grad_w = _plain(M), _plain(z), _plain(grad_z), _plain(grad_w)
         n = z.shape[-1]
-        floats, integers = np.empty(n * n + 2 * n), np.empty(3 * n, dtype=np.int64)  # scratch
-        _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M, grad_q)
+        floats, integers = np.empty(n * n + 4 * n), np.empty(3 * n, dtype=np.int64)  # scratch
+        _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, single_precision, grad_M, grad_q)
     return (grad_M if need_M else None), grad_q
 
 
@@ -187,6 +191,27 @@ def _pointer_code(_, address, example):
 
 
 _pointer: Any = intrinsic(_pointer_code)
+
+
+def _add_multiple_code(_, target, source, factor, blocks):
+    """target += factor * source for vectors of 4 doubles; LLVM's own vectoriser leaves rests of up to 15 to scalars."""
+
+    def codegen(context, builder, signature, args):
+        four = ir.VectorType(ir.DoubleType(), 4)
+        undefined = ir.Constant(four, ir.Undefined)
+        target, source = (builder.inttoptr(address, four.as_pointer()) for address in args[:2])
+        f = builder.insert_element(undefined, args[2], ir.IntType(32)(0))
+        f = builder.shuffle_vector(f, undefined, ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4))
+        with cgutils.for_range(builder, args[3]) as loop:
+            t, s = builder.gep(target, [loop.index]), builder.gep(source, [loop.index])
+            product = builder.fmul(builder.load(s, align=8), f, flags=("contract",))
+            builder.store(builder.fadd(builder.load(t, align=8), product, flags=("contract",)), t, align=8)
+        return context.get_dummy_value()
+
+    return types.void(types.uintp, types.uintp, types.float64, types.intp), codegen
+
+
+_add_multiple: Any = intrinsic(_add_multiple_code)
 
 
 @_jit
@@ -265,12 +290,19 @@ def _solve(A, k, rank, rows, cols, x, scratch):
 
 
 @_jit_inline
-def _gather(S, basis, A, index):
-    """Copy S_AA to A and A's members to index; its size."""
+def _members(basis, index):
+    """Write the members of the basis to index; their number."""
     k = 0
-    for i in range(S.shape[0]):  # without a branch, as it would be mispredicted half of the time; so below
+    for i in range(basis.size):  # without a branch, as it would be mispredicted half of the time; so below
         index[k] = i
         k += basis[i]
+    return k
+
+
+@_jit_inline
+def _gather(S, basis, A, index):
+    """Copy S_AA to A and A's members to index; its size."""
+    k = _members(basis, index)
     for a in range(k):
         i = index[a]
         for b in range(k):
@@ -294,7 +326,7 @@ def _all_finite(x):
     """Whether no entry is NaN or infinite."""
     bad = 0
     for value in x.flat:
-        bad += not abs(value) <= 1.7976931348623157e308
+        bad += not abs(value) <= LARGEST
     return bad == 0
 
 
@@ -320,15 +352,15 @@ def _equilibrate(M, size, largest, d):
                 one, other = size[i, j] * di, size[k, j] * dk
                 one = one if one > other else other
                 largest[j] = one if one > largest[j] else largest[j]
-        moved = 0
+        uneven = 0
         for j in range(n):
             scaled = largest[j] * d[j]
             largest[j] = scaled if scaled > 0.0 else 1.0
-            moved += abs(largest[j] - 1.0) > 1e-6
-        for j in range(n):
-            d[j] /= sqrt(max(largest[j], 2.2250738585072014e-308))
-        if moved == 0:  # further sweeps would change the residual by a millionth
+            uneven += abs(largest[j] - 1.3) > 0.83  # as in residuals.py
+        if uneven == 0:
             break
+        for j in range(n):
+            d[j] /= sqrt(max(largest[j], TINY))
 
 
 @_jit
@@ -360,7 +392,7 @@ def _scale(M, q, r, c, S, p):
         row_bits[i] &= _EXPONENT
         column_bits[i] &= _EXPONENT
         s = max(s, abs(r[i] * q[i]))
-    s = ldexp(0.5, frexp(s)[1])
+    s = ldexp(0.5, frexp(max(s, TINY))[1])
     for i in range(n):
         ri = r[i]
         p[i] = ri * q[i] / s
@@ -387,25 +419,24 @@ def _evaluate(S, p, z, w, omega):
 def _judge(q, p, d, r, c, s, z, w, omega, tol):
     """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
     n = q.size
-    z_size = 0.0
+    smallest = TINY / s if s < 1e-150 else 0.0  # not a denormal, with which arithmetic is slow
+    z_size, q_size, natural, noise, rows, absMz, absq, total = smallest, smallest, 0.0, 0.0, 0.0, 0.0, TINY, 0.0
     for i in range(n):
         z_size = max(z_size, c[i] * z[i])
-    natural, noise, q_size, rows, absMz, absq, total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         f = d[i] / r[i]
         natural = max(natural, abs(min(c[i] * z[i] / d[i], w[i] * f)))
         noise = max(noise, EPS * f * omega[i] if abs(w[i]) <= 8.0 * EPS * omega[i] else 0.0)
         q_size = max(q_size, f * abs(p[i]))
-        z_share = c[i] * z[i] / z_size if z[i] > 0.0 else 0.0
-        w_share = w[i] / omega[i] if w[i] != 0.0 else 0.0
-        rows = max(rows, abs(min(z_share, w_share)))
+        w_share = w[i] / max(omega[i], smallest * r[i]) if w[i] != 0.0 else 0.0
+        rows = max(rows, abs(min(c[i] * z[i] / z_size if z[i] > 0.0 else 0.0, w_share)))
         absMz = max(absMz, (omega[i] - abs(p[i])) / r[i])
         absq = max(absq, abs(q[i]))
-        total += abs(w[i]) + c[i] * s * z[i]
+        total += abs(w[i]) * s / r[i] + c[i] * s * z[i]
     residual = max(natural / q_size, rows)
-    if noise / q_size > 1e-6:  # w = 0 by luck, as for z = 1e18 (1, 1) and M = [[1, -1], [1, -1]], q = -1
+    if noise > 1e-6 * q_size:
         residual = max(residual, noise / q_size)
-    if not total <= _LARGEST:
+    if not total <= LARGEST:
         residual = np.inf
     return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))
 
@@ -455,17 +486,37 @@ def _refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch):
 
 
 @_jit
-def _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, scratch):
-    """Refine z on the basis from the data; a singular S_AA gives a basic solution of the consistent equations."""
+def _polish(S, p, basis, T, place, inverted, A, rows, cols, index, z, w, omega, x, scratch):
+    """Refine z on the basis from the data, by the tableau's inverse of S_AA or else by LU.
+
+    A singular S_AA gives a basic solution of the consistent equations.
+    """
     n = p.size
+    k = _members(basis, index)
+    z_size = 0.0
     for i in range(n):
         z[i] = z[i] if basis[i] else 0.0
+        z_size = max(z_size, z[i])
+    noise = 0.0
+    if inverted:
+        for i in range(n):
+            z[i] = z[i] if z[i] > 64.0 * EPS * z_size else 0.0
     _evaluate(S, p, z, w, omega)
-    wrong = 0
-    for i in range(n):
-        wrong += basis[i] != 0 and abs(w[i]) > 32.0 * EPS * omega[i]
-    if wrong == 0:
-        return
+    for attempt in range(2):
+        wrong = 0
+        for a in range(k):
+            wrong += abs(w[index[a]]) > max(32.0 * EPS * omega[index[a]], noise)
+        if wrong == 0:
+            return
+        if inverted and attempt == 0:
+            for a in range(k):
+                row = place[n + index[a]]
+                total = z[index[a]]
+                for b in range(k):
+                    total -= T[-1 - place[index[b]], row] * w[index[b]]
+                z[index[a]] = max(total, 0.0)
+            noise = 4.0 * EPS * z_size
+            _evaluate(S, p, z, w, omega)
     k = _gather(S, basis, A, index)
     rank = _factor(A, k, rows, cols, 4.0 * n * EPS, False)
     if rank < k:
@@ -525,84 +576,88 @@ def _block_pivoting(S, p, basis, A, rows, cols, index, wrong, z, w, omega, x, sc
 @_jit_inline
 def _start_tableau(S, p, cover, T, basic, column, place):
     """Dictionary at w = p + S z + cover z_0, with z_0 already exchanged for the lexicographically smallest row."""
-    n, width = T.shape
+    n = p.size
     row, smallest = 0, np.inf
     for i in range(n):
         basic[i], column[i] = i, n + i
         place[i], place[n + i] = i, -1 - i
         if p[i] / cover[i] <= smallest:  # ties: the last has the smallest row of the identity
             row, smallest = i, p[i] / cover[i]
+    inverse = 1.0 / cover[row]
     for i in range(n):
-        ratio = cover[i] / cover[row]
-        for j in range(n):
-            T[i, j] = S[i, j] - ratio * S[row, j]
-        T[i, n], T[i, n + 1] = ratio, p[i] - ratio * p[row]
-        for j in range(n + 2, width):
-            T[i, j] = 0.0
+        T[n, i] = ratio = cover[i] * inverse
+        T[n + 1, i] = p[i] - ratio * p[row]
+    T[n, row], T[n + 1, row] = inverse, -p[row] * inverse
     for j in range(n):
-        T[row, j] = -S[row, j] / cover[row]
-    T[row, n], T[row, n + 1] = 1.0 / cover[row], -p[row] / cover[row]
+        pivot = S[row, j]
+        for i in range(n):
+            T[j, i] = S[i, j] - T[n, i] * pivot
+        T[j, row] = -pivot * inverse
+    for j in range(n + 2):
+        for i in range(n, T.shape[1]):
+            T[j, i] = 0.0
     basic[row], column[n] = 2 * n, row
     place[2 * n], place[row] = row, -1 - n
     return row
 
 
 @_jit_inline
-def _exchange(T, basic, column, place, row, c, buffer):
+def _exchange(T, basic, column, place, row, c, factor, buffer):
     """Pivot: the nonbasic variable of column c becomes basic in this row."""
-    n, width = T.shape  # columns beyond n + 2 are zeros
-    inverse = 1.0 / T[row, c]
-    T[row, c] = -1.0
-    for j in range(width):
-        buffer[j] = -inverse * T[row, j]
-    for j in range(width):
-        T[row, j] = 0.0  # so that its own factor is zero
-    for i in range(0, n, 2):  # two rows at a time
-        k = i + 1 if i + 1 < n else i
-        one, other = T[i, c], T[k, c] if k > i else 0.0
-        if one != 0.0 or other != 0.0:
-            T[i, c] = 0.0
-            T[k, c] = 0.0
-            for j in range(width):
-                T[i, j] += one * buffer[j]
-                T[k, j] += other * buffer[j]
-    for j in range(width):
-        T[row, j] = buffer[j]
+    rows = T.shape[1]
+    inverse = 1.0 / T[c, row]
+    for i in range(rows):
+        buffer[i] = T[c, i]
+        T[c, i] = 0.0
+    buffer[row] = 1.0
+    T[c, row] = -1.0
+    for j in range(T.shape[0]):
+        factor[j] = -inverse * T[j, row]
+        T[j, row] = 0.0
+    target, source = T.ctypes.data, buffer.ctypes.data
+    for j in range(T.shape[0]):
+        _add_multiple(target, source, factor[j], rows // 4)
+        target += 8 * rows
     basic[row], column[c] = column[c], basic[row]
     place[basic[row]], place[column[c]] = row, -1 - c
 
 
 @_jit_inline
-def _leaving_row(T, basic, place, c, tolerance, ratio, tied):
+def _leaving_row(T, place, c, tolerance, ratio, tied):
     """Row that first reaches zero as the variable of column c grows, by the lexicographic rule; -1 on a ray."""
-    n = basic.size
-    best = np.inf
+    n = T.shape[0] - 2
     for i in range(n):
-        slope = -T[i, c]
-        ratio[i] = max(T[i, n + 1], 0.0) / slope if slope > tolerance else np.inf
-        best = min(best, ratio[i])
+        slope, value = -T[c, i], T[n + 1, i]
+        value = (value if value > 0.0 else 0.0) / slope
+        ratio[i] = value if slope > tolerance else np.inf
+    best, other = np.inf, np.inf
+    for i in range(0, n, 2):
+        k = min(i + 1, n - 1)
+        best = ratio[i] if ratio[i] < best else best
+        other = ratio[k] if ratio[k] < other else other
+    best = min(best, other)
     if best == np.inf:
         return -1
+    best += 1e-12 * (1.0 + best)
+    if place[2 * n] >= 0 and ratio[place[2 * n]] <= best:  # z_0 leaves whenever it can: this is the solution
+        return place[2 * n]
     count = 0
     for i in range(n):
-        if ratio[i] <= best + 1e-12 * (1.0 + best):
-            if basic[i] == 2 * n:  # z_0 leaves whenever it can: this is the solution
-                return i
-            tied[count] = i
-            count += 1
+        tied[count] = i
+        count += ratio[i] <= best
     j = 0
     while count > 1 and j < n:
         where = place[j]
         best = np.inf
         for t in range(count):
             i = tied[t]
-            ratio[i] = T[i, -1 - where] / T[i, c] if where < 0 else (-1.0 / T[i, c] if where == i else 0.0)
-            best = min(best, ratio[i])
+            ratio[t] = T[-1 - where, i] / T[c, i] if where < 0 else (1.0 if where == i else 0.0)
+            best = ratio[t] if ratio[t] < best else best
+        best += 1e-12 * (1.0 + abs(best))
         kept = 0
         for t in range(count):
-            if ratio[tied[t]] <= best + 1e-12 * (1.0 + abs(best)):
-                tied[kept] = tied[t]
-                kept += 1
+            tied[kept] = tied[t]
+            kept += ratio[t] <= best
         count = kept
         j += 1
     return tied[0]
@@ -617,56 +672,63 @@ def _lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied,
     while pivots < cap:
         entering = leaving + n if leaving < n else leaving - n
         c = -1 - place[entering]
-        row = _leaving_row(T, basic, place, c, tolerance, ratio, tied)
+        row = _leaving_row(T, place, c, tolerance, ratio, tied)
         if row < 0:
             ended = STUCK
             break
         leaving = basic[row]
-        _exchange(T, basic, column, place, row, c, buffer)
+        _exchange(T, basic, column, place, row, c, ratio, buffer)
         pivots += 1
         if leaving == 2 * n:
             ended = DONE
             break
     for i in range(n):
         basis[i] = place[n + i] >= 0
-        z[i] = max(T[place[n + i], n + 1], 0.0) if basis[i] else 0.0
+        z[i] = max(T[n + 1, place[n + i]], 0.0) if basis[i] else 0.0
     return ended, pivots
 
 
 @_jit
-def _prove_infeasible(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, u, cap):
+def _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, ratio, tied, u, cap):
     """Minimise z_0 subject to S z + cover z_0 + p >= 0; where the minimum is positive its dual u is Farkas' proof.
 
-    At the optimum z_0 = b + u.w + v.z with u, v >= 0 holds identically in z: S'u = -v <= 0 and p.u = -b < 0.
+    At the optimum z_0 = b + u.w + v.z with u, v >= 0 holds identically in z: S'u = -v <= 0 and p.u = -b < 0. In units
+    of M and q it is R u; whether that proves anything is judged there.
     """
     n = p.size
+    cover[:] = 1.0
     row = _start_tableau(S, p, cover, T, basic, column, place)
     u[:] = 0.0
     for _ in range(cap):
         row = place[2 * n]
-        c, steepest = -1, -tolerance
+        c, steepest = -1, -1e-11
         for j in range(n + 1):
-            if T[row, j] < steepest:
-                c, steepest = j, T[row, j]
+            if T[j, row] < steepest:
+                c, steepest = j, T[j, row]
         if c < 0:
             break
-        leaving = _leaving_row(T, basic, place, c, tolerance, ratio, tied)
+        leaving = _leaving_row(T, place, c, 1e-11, ratio, tied)
         if leaving < 0 or basic[leaving] == 2 * n:
             return False
-        _exchange(T, basic, column, place, leaving, c, buffer)
+        _exchange(T, basic, column, place, leaving, c, ratio, buffer)
+    largest = 0.0
     for i in range(n):
         if place[i] < 0:
-            u[i] = max(T[place[2 * n], -1 - place[i]], 0.0)
-    pu, size = 0.0, 0.0
+            u[i] = max(T[-1 - place[i], place[2 * n]], 0.0) * r[i]
+            largest = max(largest, u[i])
+    if not 0.0 < largest <= LARGEST:
+        return False
+    qu, size = 0.0, 0.0
     for i in range(n):
-        pu += p[i] * u[i]
-        size += abs(p[i]) * u[i]
-    proven = pu <= -1e-9 * size and size > 0.0
+        u[i] /= largest
+        qu += q[i] * u[i]
+        size += abs(q[i]) * u[i]
+    proven = qu <= -1e-9 * size and 0.0 < size <= LARGEST
     for j in range(n):
         total, size = 0.0, 0.0
         for i in range(n):
-            total += S[i, j] * u[i]
-            size += abs(S[i, j]) * u[i]
+            total += M[i, j] * u[i]
+            size += abs(M[i, j]) * u[i]
         proven = proven and total <= 1e-12 * size
     return proven
 
@@ -739,87 +801,81 @@ def _interior_point(S, p, A, rows, cols, z, w, omega, r, dz, dw, scratch, cap):
 def _prepare_lemke(stage, single_precision, cover):
     """Fill the covering vector and return the smallest pivot of a try: the size of the data's precision first.
 
-    The second try has an irregular vector: another path, without the old ray or cycle.
+    The third try has an irregular vector: another path, without the old ray or cycle.
     """
     for i in range(cover.size):
-        cover[i] = 1.0 + (0.6180339887498949 * (i + 1)) % 1.0 if stage == 2 else 1.0
-    if stage == 1 or stage == 5:
-        return 1e-6 if single_precision else 1e-9
-    if stage == 2:
-        return 1e-4 if single_precision else 1e-7
-    return 1e-9 if single_precision else 1e-12
+        cover[i] = 1.0 + (0.6180339887498949 * (i + 1)) % 1.0 if stage == 4 else 1.0
+    precision = 1e-6 if single_precision else 1e-9
+    return precision * (100.0 if stage == 4 else (1e-3 if stage == 5 else 1.0))
+
+
+@_jit_inline
+def _write(z, w, basis, c, s, r, z_out, w_out, basis_out):
+    """Put a scaled solution into the caller's arrays, with exact zeros."""
+    for i in range(z.size):
+        z_out[i] = c[i] * s * z[i] if basis[i] else 0.0
+        w_out[i] = 0.0 if basis[i] else max(w[i], 0.0) * s / r[i]
+        basis_out[i] = basis[i] != 0
 
 
 @_jit_inline
 def _solve_one(
-    M, q, tol, single_precision, budget, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
+    M, q, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
     rows, cols, index, basic, basis, column, place, z_out, w_out, basis_out, u_out
 ):  # fmt: skip
-    """Run the cascade for one finite element with some q_i < 0; status, residual and iterations. Stages:
+    """Run the cascade for one finite element with some q_i < 0; status, residual and iterations.
 
-    0 block pivoting; 1, 2, 3 Lemke's method; 4, 5 both with rows and columns scaled apart; 6 interior point. What is
-    infeasible is found out when Lemke's method first ends on a ray.
+    Stages: 0 block pivoting, where it is the faster; 1 Lemke's method; 2 block pivoting from the basis of Lemke's method
+    unless that was right to almost all digits; 3, 4, 5 Lemke's method with rows and columns scaled apart; 6 interior
+    point. What is infeasible is found out when Lemke's method first ends on a ray.
     """
     n = q.size
-    best, used, capped, asked = np.inf, 0, False, False
+    best, used, accepted, capped, asked = np.inf, 0, False, False, False
     s = _scale(M, q, r, c, S, p)
-    stage = -1
-    while stage < 6:
+    stage = -1 if warm or n < 6 or n > 40 else 0
+    while stage < 6 and not (accepted and (stage != 1 or best <= 1e-3 * tol)):
         stage = 6 if capped else stage + 1
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
             capped = True
             break
-        if stage == 4:
+        if stage == 3:
             _rescale(M, r, c)
             s = _scale(M, q, r, c, S, p)
-        if stage == 0 or stage == 4:
-            if stage == 4:
-                for i in range(n):
-                    basis[i] = p[i] < 0.0
+        if stage == 0 or stage == 2:
             ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left))
         elif stage < 6:
             pivot = _prepare_lemke(stage, single_precision, cover)
             cap = left if budget >= 0 else 10 * n + 50
             ended, count = _lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
             capped = ended == CAPPED
-            _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
+            _polish(S, p, basis, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
         else:
             for i in range(n):
                 r[i] = c[i] = d[i]
             s = _scale(M, q, r, c, S, p)
-            ended = DONE
+            ended = STUCK
             count = _interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, min(80, left))
             for i in range(n):
                 basis[i] = z[i] > w[i]
-            _polish(S, p, basis, A, rows, cols, index, z, w, omega, x, y)
+            _polish(S, p, basis, T, place, False, A, rows, cols, index, z, w, omega, x, y)
         used += count
-        if (stage == 0 or stage == 4) and ended != DONE:
+        if (stage == 0 or stage == 2) and ended != DONE:
             continue
         residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
         if residual > limit and _drop_noise(z, w, omega, S, tol):
             _evaluate(S, p, z, w, omega)
             residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
         if residual < best:
-            best = residual
-            for i in range(n):
-                z_out[i] = c[i] * s * z[i] if basis[i] else 0.0
-                w_out[i] = 0.0 if basis[i] else max(w[i], 0.0) * s / r[i]
-                basis_out[i] = basis[i] != 0
-        if residual <= limit:
-            return SOLVED, residual, used
-        if not asked and (ended == STUCK or stage == 6):
+            best, accepted = residual, residual <= limit
+            _write(z, w, basis, c, s, r, z_out, w_out, basis_out)
+        if ended == STUCK and not asked and not accepted:
             asked = True
-            cover[:] = 1.0
-            if _prove_infeasible(S, p, cover, 1e-11, T, basic, column, place, buffer, x, index, v, 20 * n + 50):
-                largest = 0.0
+            if _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, 20 * n + 50):
                 for i in range(n):
-                    u_out[i] = r[i] * v[i]
-                    largest = max(largest, u_out[i])
-                for i in range(n):
-                    u_out[i] /= largest
+                    u_out[i] = v[i]
                 return INFEASIBLE, best, used
-    return (MAX_ITERATIONS if capped else UNSOLVED), best, used
+    return (SOLVED if accepted else MAX_ITERATIONS if capped else UNSOLVED), best, used
 
 
 @_jit
@@ -842,14 +898,14 @@ def _solve_range(
 ):
     """Run the cascade for each element; the last arguments are the fields of PivotingResult."""
     B, n = z_out.shape
-    width = (n + 5) // 4 * 4  # whole vectors of 4 doubles
+    width = (n + 3) // 4 * 4  # whole vectors of 4 doubles
     Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
     qs = numba.carray(_pointer(q.ctypes.data, 0.0), q.shape)
-    S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n, width)
-    f = n * (2 * n + width)
+    S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n + 2, width)
+    f = 2 * n * n + (n + 2) * width
     d, p, cover = _vector(floats, f, n), _vector(floats, f + n, n), _vector(floats, f + 2 * n, n)
     z, w, omega = _vector(floats, f + 3 * n, n), _vector(floats, f + 4 * n, n), _vector(floats, f + 5 * n, n)
-    x, y, v = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 8 * n, n)
+    y, v, x = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 11 * n + width, n + 2)
     r, c, buffer = _vector(floats, f + 9 * n, n), _vector(floats, f + 10 * n, n), _vector(floats, f + 11 * n, width)
     zs = numba.carray(_pointer(z_out.ctypes.data, 0.0), z_out.shape)
     ws = numba.carray(_pointer(w_out.ctypes.data, 0.0), w_out.shape)
@@ -864,26 +920,46 @@ def _solve_range(
             residual_out[b], status_out[b] = np.inf, NONFINITE_INPUT
             continue
         if _nonnegative(qb):
-            z_out[b], w_out[b], basis_out[b] = 0.0, qb, False
+            for i in range(n):
+                zs[b, i], ws[b, i], basis_out[b, i] = 0.0, qb[i], False
             continue
-        z_out[b], w_out[b] = 0.0, 0.0  # in case no stage has a candidate
         _equilibrate(Mb, A, x, d)
         for i in range(n):
             r[i] = c[i] = d[i]
             basis[i] = basis_out[b, i] if warm else qb[i] < 0.0
-            basis_out[b, i] = False
+            zs[b, i], ws[b, i], basis_out[b, i] = 0.0, 0.0, False  # in case no stage has a candidate
         status_out[b], residual_out[b], iterations_out[b] = _solve_one(
-            Mb, qb, tol, single_precision, budget, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
+            Mb, qb, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
             rows, cols, index, basic, basis, column, place, zs[b], ws[b], basis_out[b], us[b]
         )  # fmt: skip
 
 
 @_jit
-def _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M, grad_q):
+def _equilibrate_rows_and_columns(A, k, r, s):
+    """Scale A[:k, :k] in place to r_i A_ij s_j: largest entry of each row at most 1, of each column 1."""
+    for i in range(k):
+        largest = 0.0
+        for j in range(k):
+            largest = max(largest, abs(A[i, j]))
+        r[i] = 1.0 / largest if largest > 0.0 else 1.0
+    for j in range(k):
+        largest = 0.0
+        for i in range(k):
+            largest = max(largest, abs(A[i, j]) * r[i])
+        s[j] = 1.0 / largest if largest > 0.0 else 1.0
+    for i in range(k):
+        for j in range(k):
+            A[i, j] *= r[i] * s[j]
+
+
+@_jit
+def _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, single_precision, grad_M, grad_q):
     """The adjoint of each element; see `solve_adjoint`."""
     B, n = z.shape
+    singular, dependent = (n * 1e-7, 1e-5) if single_precision else (n * EPS, 1e-11)
     A = _matrix(floats, 0, n, n)
     x, scratch = _vector(floats, n * n, n), _vector(floats, n * n + n, n)
+    r, s = _vector(floats, n * n + 2 * n, n), _vector(floats, n * n + 3 * n, n)
     rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
     Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
     for b in range(B):
@@ -897,12 +973,11 @@ def _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M
                 if basis[b, i]:
                     index[k] = i
                     k += 1
-            largest = 0.0
             for a in range(k):
                 for c in range(k):
                     A[c, a] = Mb[index[a], index[c]]
-                    largest = max(largest, abs(A[c, a]))
-            rank = _factor(A, k, rows, cols, (1e-11 if complete else n * EPS) * largest, complete == 1)
+            _equilibrate_rows_and_columns(A, k, r, s)  # whether a pivot is zero must not depend on units
+            rank = _factor(A, k, rows, cols, dependent if complete else singular, complete == 1)
             if rank == k:
                 break
         for a in range(k):
@@ -912,9 +987,11 @@ def _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, grad_M
                 grad_q[b, i] = grad_w[b, i]
                 for a in range(k):
                     x[a] -= Mb[i, index[a]] * grad_w[b, i]
+        for a in range(k):
+            x[a] *= r[a]
         _solve(A, k, rank, rows, cols, x, scratch)
         for a in range(k):
-            grad_q[b, index[a]] = x[a]
+            grad_q[b, index[a]] = s[a] * x[a]
         if grad_M.shape[0] > 0:
             m = b if grad_M.shape[0] > 1 else 0
             for i in range(n):

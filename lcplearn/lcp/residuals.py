@@ -7,7 +7,12 @@ With w = M z + q, the residual of z is the larger of two, where 0/0 counts as 0:
 (b) max_i |min(z_i / max_j |z_j|, w_i / omega_i)| with omega_i = |q_i| + sum_j |M_ij| |z_j|.
 
 Both are unchanged under z -> b/a z for (a M, b q), (a) also under congruence. Neither alone will do: (a) does not see
-tiny decoupled rows, (b) accepts z = t (1, 1) with large t for M = [[1, -1], [-1, 1]], q = -1.
+tiny decoupled rows, (b) accepts z = t (1, 1) with large t for M = [[1, -1], [-1, 1]], q = -1. Sizes below 2.2e-308
+count as 2.2e-308, since smaller doubles have no precision.
+
+(c) A w that is rounding noise verifies nothing: rows with |w_i| <= 8 eps omega_i count with eps d_i omega_i / max |q~|
+where that is above 1e-6. M = [[2, -2], [1, -1]], q = (-2, -2) has no solution, but with z = 1e18 (1, 1) the sum
+q + M z comes out as exactly 0 if q is added first.
 
 With smoothing tau the condition z_i w_i = tau replaces z_i w_i = 0, and its smoothed minimum replaces min: the root
 s(z, w) = (z + w - sqrt((z - w)^2 + 4 tau)) / 2 is zero exactly where z, w > 0 and z w = tau (Chen-Harker-Kanzow-Smale).
@@ -20,6 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 EPS = torch.finfo(torch.float64).eps
+TINY = torch.finfo(torch.float64).tiny
 RUIZ_SWEEPS = 4
 
 
@@ -38,14 +44,17 @@ def default_tolerance(dtype: torch.dtype) -> float:
 def equilibrate(M: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n"]:
     """Positive d such that rows and columns of d_i M_ij d_j have largest entries near 1 (symmetric Ruiz scaling).
 
-    Rows and columns of zeros keep d_i = 1.
+    Rows and columns of zeros keep d_i = 1. An element is left alone once all its maxima are near 1: each further sweep
+    would cost a solver of small problems as much as several pivots.
     Source: Ruiz, "A scaling algorithm to equilibrate both rows and columns norms in matrices" (2001).
     """
     size = torch.maximum(M.abs(), M.mT.abs())
     d = torch.ones_like(M[..., 0])
     for _ in range(RUIZ_SWEEPS):
         largest = (size * d.unsqueeze(-2)).amax(-1) * d
-        d = torch.where(largest > 0, d / largest.clamp_min(torch.finfo(M.dtype).tiny).sqrt(), d)
+        largest = torch.where(largest > 0, largest, 1.0)
+        even = ((largest - 1.3).abs() <= 0.83).all(-1, keepdim=True)  # no product of roots of small integers
+        d = torch.where(even, d, d / largest.clamp_min(torch.finfo(M.dtype).tiny).sqrt())
     return d
 
 
@@ -89,19 +98,16 @@ def judge(
     absMz = (M.abs() @ z.abs().unsqueeze(-1)).squeeze(-1)
     w = Mz + q
     d = equilibrate(M)
-    q_size = (d * q).abs().amax(-1)
+    q_size = (d * q).abs().amax(-1).clamp_min(TINY)
     natural = smoothed_minimum(z / d, d * w, smoothing).abs().amax(-1)
-    z_size = z.abs().amax(-1, keepdim=True)
+    z_size = z.abs().amax(-1, keepdim=True).clamp_min(TINY)
     omega = q.abs() + absMz
     product = z_size * omega
     tau = torch.where(product > 0, smoothing / product, 0.0) if smoothing else 0.0
-    rows = smoothed_minimum(_ratio(z, z_size), _ratio(w, omega), tau).abs().amax(-1)
-    residual = torch.maximum(_ratio(natural, q_size), rows)
+    rows = smoothed_minimum(z / z_size, w / omega.clamp_min(TINY), tau).abs().amax(-1)
+    residual = torch.maximum(natural / q_size, rows)
+    noise = torch.where(w.abs() <= 8 * EPS * omega, EPS * d * omega, 0.0).amax(-1) / q_size
+    residual = torch.where(noise > 1e-6, torch.maximum(residual, noise), residual)
     residual = torch.where(residual.isfinite(), residual, torch.inf)
-    rounding = 10 * EPS * _ratio(absMz.amax(-1), q.abs().amax(-1))
+    rounding = 10 * EPS * absMz.amax(-1) / q.abs().amax(-1).clamp_min(TINY)
     return Judgement(residual, rounding.clamp(max=1e-6).clamp(min=tol))
-
-
-def _ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """numerator / denominator with 0/0 = 0."""
-    return torch.where(numerator == 0, 0.0, numerator / denominator)
