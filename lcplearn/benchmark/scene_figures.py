@@ -75,7 +75,7 @@ def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
             for row, a, b in zip(own[1::3], x[1::3], y[1::3], strict=True):
                 label = f"dt {float(row['dt']):.2g}"
                 right.annotate(label, (a, b), (5, 3), textcoords="offset points", fontsize=7)
-    right.set_xlabel("time of a trajectory of 1 s [s]")
+    right.set_xlabel("CPU time of a trajectory of 1 s [s]")
     right.set_ylabel("largest position error [m]")
     right.legend(fontsize=8, frameon=False, loc="lower left")
     right.set_title("error against time (rows of the LCP)", fontsize=10)
