@@ -1,0 +1,95 @@
+"""The judge in torch and the judge inside the CPU kernel are one judge."""
+
+import numpy as np
+import pytest
+import torch
+
+from lcplearn.benchmark import problems
+from lcplearn.lcp import pivoting
+from lcplearn.lcp.residuals import equilibrate, judge
+
+
+def judged_by_kernel(M: np.ndarray, q: np.ndarray, z: np.ndarray, tol: float = 1e-10) -> tuple[float, float]:
+    """Residual and tolerance by the kernel's own steps, for one problem."""
+    n = len(q)
+    d, largest, p, w, omega = np.empty((5, n))
+    size, S = np.empty((2, n, n))
+    pivoting._equilibrate(M, size, largest, d)
+    r, c = d.copy(), d.copy()
+    s = pivoting._scale(M, q, r, c, S, p)
+    scaled = z / s / c
+    pivoting._evaluate(S, p, scaled, w, omega)
+    return pivoting._judge(q, p, d, r, c, s, scaled, w, omega, tol)
+
+
+def judged_by_torch(M: np.ndarray, q: np.ndarray, z: np.ndarray, tol: float = 1e-10) -> tuple[float, float]:
+    verdict = judge(torch.from_numpy(M), torch.from_numpy(q), torch.from_numpy(z), tol=tol)
+    return verdict.residual.item(), verdict.tolerance.item()
+
+
+def assert_same_verdict(M: np.ndarray, q: np.ndarray, z: np.ndarray) -> None:
+    (one, one_tol), (other, other_tol) = judged_by_kernel(M, q, z), judged_by_torch(M, q, z)
+    size = (np.abs(q) + np.abs(M) @ z).max() / np.abs(q).max()
+    assert one == pytest.approx(other, rel=1e-9, abs=1e-14 * max(1.0, size))
+    assert one_tol == pytest.approx(other_tol, rel=1e-9)
+    assert (one <= one_tol) == (other <= other_tol)
+
+
+@pytest.mark.parametrize("name", [name for name in problems.RANDOM_FAMILIES if "100" not in name])
+@pytest.mark.parametrize("error", [0.0, 1e-12, 1e-6, 1.0])
+def test_both_judges_agree_on_right_and_wrong_solutions_of_every_family(name, error):
+    rng = np.random.default_rng(1)
+    M, q, _ = problems.RANDOM_FAMILIES[name](rng, 10)
+    result = pivoting.solve_batch(M, q, single_precision=False, max_iter=None)
+    for b in range(10):
+        assert_same_verdict(M[b], q[b], result.z[b] * np.exp(error * rng.standard_normal(q.shape[1])))
+
+
+@pytest.mark.parametrize("size", [1e-280, 1e-100, 1.0, 1e100, 1e280])
+def test_both_judges_agree_on_data_of_any_size(size):
+    rng = np.random.default_rng(2)
+    M, q, z = problems.nonsymmetric(rng, 10, 6)
+    assert z is not None
+    for b in range(10):
+        assert_same_verdict(M[b], size * q[b], size * z[b])
+        assert_same_verdict(M[b], size * q[b], 1.01 * size * z[b])
+
+
+@pytest.mark.parametrize("t", [0.0, 1.0, 1e6, 1e12, 1e18, 1e100])
+def test_huge_z_whose_w_is_rounding_noise_is_refused_by_both_judges(t):
+    q, z = np.array([-2.0, -2.0]), np.array([t, t])
+    for M in ([[2.0, -2.0], [1.0, -1.0]], [[1.0, -1.0], [-1.0, 1.0]]):
+        for residual, tolerance in (judged_by_kernel(np.array(M), q, z), judged_by_torch(np.array(M), q, z)):
+            assert residual > tolerance
+
+
+def test_exact_solutions_have_residual_zero_in_both_judges():
+    M, q, z = np.array([[2.0, 1.0], [0.0, 4.0]]), np.array([-3.0, -4.0]), np.array([1.0, 1.0])
+    assert judged_by_kernel(M, q, z)[0] == judged_by_torch(M, q, z)[0] == 0.0
+
+
+@pytest.mark.parametrize("q", [-5e-324, -1e-310, -2.5e-308])
+@pytest.mark.parametrize("m", [1e-300, 0.5, 3.0])
+def test_data_below_the_range_of_full_precision_get_a_finite_answer_that_both_judges_accept(q, m):
+    M, q = np.array([[m]]), np.array([q])
+    result = pivoting.solve_batch(M[None], q[None], single_precision=False, max_iter=None)
+    assert result.status[0] == pivoting.SOLVED
+    assert np.isfinite(result.z).all()
+    for z in (result.z[0], -q / m):
+        residual, tolerance = judged_by_torch(M, q, z)
+        assert residual <= tolerance
+
+
+def test_equilibration_of_an_element_does_not_depend_on_its_neighbours():
+    rng = np.random.default_rng(3)
+    even, uneven = np.eye(4), 10.0 ** rng.uniform(-6, 6, (4, 4))
+    together = equilibrate(torch.from_numpy(np.stack([even, uneven])))
+    for M, d in zip((even, uneven), together, strict=True):
+        torch.testing.assert_close(equilibrate(torch.from_numpy(M)), d, rtol=0, atol=0)
+
+
+def test_equilibrated_matrix_has_rows_of_size_one_within_a_factor_of_three():
+    M = torch.from_numpy(problems.badly_scaled(np.random.default_rng(4), 20, 10).M)
+    d = equilibrate(M)
+    largest = (d.unsqueeze(-1) * M * d.unsqueeze(-2)).abs().amax(-1)
+    assert ((largest > 1 / 3) & (largest < 3)).all()
