@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 DEBUGGING = os.environ.get("HYDRA_FULL_ERROR") == "1"
-MISTAKES = (HydraException, OmegaConfBaseException, ValueError, FileNotFoundError)
+MISTAKES = (HydraException, OmegaConfBaseException, ValueError, OSError)
 CONF = Path(__file__).parent / "conf"
 
 

@@ -93,10 +93,18 @@ def fit(
         The model, its figures and the folder with best.ckpt, last.ckpt, metrics.json, config.yaml and pictures.
 
     Raises:
-        ValueError: loss and model don't fit, a checkpoint that can't be resumed, or a folder that holds a run already.
+        ValueError: loss, data and model don't fit, no epoch, a checkpoint that can't be resumed, or a folder that
+            holds a run already.
         TrainingInterrupted: a signal ended the training.
     """
     loss, optimizer = dict(loss or {"prediction": 1.0}), optimizer or Optimizer()
+    if (model.dt, model.gravity) != (data.dt, data.gravity):
+        raise ValueError(
+            f"model: expected dt = {data.dt} s and gravity = {data.gravity} m/s^2 as in the data, "
+            f"got {model.dt} and {model.gravity}"
+        )
+    if epochs < 1:
+        raise ValueError(f"epochs: expected at least 1, got {epochs}")
     folder = _new_folder(folder)
     _quiet()
     batches, validation = windows(data.train, horizon), windows(data.validation, horizon)

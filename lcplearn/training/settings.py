@@ -41,6 +41,8 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) ->
         _check_type(key, settings.get(key), kind)
     if settings["threads"] < 1:
         raise SettingsError(f"threads must be at least 1, got {settings['threads']}.")
+    if settings["patience"] is not None and settings["patience"] < 1:
+        raise SettingsError(f"patience must be at least 1, or null for never, got {settings['patience']}.")
     if not 0 <= settings["seed"] < 2**32:  # what NumPy's generator takes
         raise SettingsError(f"seed must be at least 0 and below 2^32, got {settings['seed']}.")
     _check_friction(settings)

@@ -76,6 +76,7 @@ def test_the_loss_terms_known_without_torch_are_those_of_the_losses() -> None:
         ("batch_size=64", "LBFGS needs the full batch: set batch_size=null, or optimizer=adam."),
         ("trainer.max_epochs=0", "trainer.max_epochs must be at least 1, got 0."),
         ("trainer.check_val_every_n_epoch=null", "trainer.check_val_every_n_epoch must be at least 1, got None."),
+        ("patience=-1", "patience must be at least 1, or null for never, got -1."),
         ("seed=-1", "seed must be at least 0 and below 2^32, got -1."),
         ("+model.dt=0.1", "Unknown setting 'model.dt'"),
         ("seed=true", "seed must be int, got True."),

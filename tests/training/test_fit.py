@@ -92,6 +92,17 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     assert torch.equal(final_state(tmp_path / "second"), final_state(tmp_path / "whole"))
 
 
+def test_a_model_of_another_time_step_or_gravity_than_the_data_is_refused(tmp_path: Path) -> None:
+    """It would learn, but another mass and friction."""
+    data = tiny_data()
+    for model in (Structured(dt=2 * data.dt), Structured(dt=data.dt, gravity=1.62)):
+        with pytest.raises(ValueError, match=r"^model: expected dt = 0\.05 s and gravity = 9\.81"):
+            short_fit(model, data, tmp_path / "run")
+    with pytest.raises(ValueError, match=r"^epochs: expected at least 1, got 0"):
+        short_fit(Structured(dt=data.dt), data, tmp_path / "run", epochs=0)
+    assert not (tmp_path / "run").exists()
+
+
 class Terminate(Callback):
     """Send the signal that a cluster sends, in the first epoch."""
 
