@@ -87,9 +87,9 @@ def motion_row(scene: str, formulation: str, dt: float, repeats: int) -> Row:
     """Follow one block for a second and compare with the exact motion.
 
     Returns:
-        seconds of one trajectory (CPU time, median); position_error, the largest at an instant [m]; end_error [m] (where a
-        slide stops; how high the first bounce goes; where a fall rests); energy_error, the largest over the energy
-        at the start (free fall: lost before impact); penetration, the deepest [m].
+        seconds of one trajectory (CPU time, median); position_error, the largest at an instant [m]; end_error [m]
+        (where a slide stops; how high the first bounce goes; where a fall rests); energy_error, the largest over the
+        energy at the start (free fall: lost before impact); penetration, the deepest [m].
     """
     step = SCENES[scene][formulation].build(dt)
     count = round(DURATION / dt)

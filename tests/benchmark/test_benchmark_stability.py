@@ -5,7 +5,7 @@ import pytest
 import torch
 from real_data import real_data
 
-from lcplearn.benchmark import noise_study, stability
+from lcplearn.benchmark import methods, noise_study, solving, stability
 from lcplearn.benchmark.hard_cases import hard_families, published_cases
 from lcplearn.benchmark.noise_study import stick_share
 from lcplearn.benchmark.solving import Answer, gradient_error, solve
@@ -105,6 +105,15 @@ def test_a_solver_that_raises_is_wrong(monkeypatch):
     row = stability.case_row(CASES[0], "pivoting")
     assert row["status"] == "RAISED IndexError"
     assert row["verdict"] == "wrong"
+
+
+def test_a_peer_that_claims_what_it_has_not_solved_is_wrong_and_one_that_says_so_gives_up(monkeypatch):
+    def peer(claims):
+        return lambda M, q: methods.Answer(np.zeros_like(q), np.full(len(q), claims))
+
+    monkeypatch.setattr(solving, "peers", lambda: {"liar": peer(True), "modest": peer(False)})
+    assert stability.case_row(CASES[0], "liar")["verdict"] == "wrong"
+    assert stability.case_row(CASES[0], "modest")["verdict"] == "gives up"
 
 
 def test_the_gradient_check_finds_a_wrong_gradient(monkeypatch):
