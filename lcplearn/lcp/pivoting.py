@@ -5,9 +5,8 @@
 Each element runs down a cascade until its residual, recomputed from the original data, is within tolerance:
 
 1. symmetric Ruiz equilibration, rounded to powers of two so that the scaled data are exact: S = E M E, p = E q / s;
-2. block principal pivoting (Newton-min with Kostreva's single-pivot safeguard) from p < 0 or an initial basis, for
-   n < 6, where most problems need one or two rounds, and n > 40, where its few factorizations cost less than Lemke's
-   many pivots, and from an initial basis; between, and on friction, whose blocks are singular, Lemke's method is faster;
+2. block principal pivoting (Newton-min with Kostreva's single-pivot safeguard) from an initial basis, or from p < 0 for
+   n < 6 and n > 40; between, where Lemke's method is faster, only to improve on what that found;
 3. Lemke's method with the lexicographic rule on the condensed tableau; where it fails, with rows and columns scaled
    apart, other pivot tolerances and another covering vector (the tolerance has the size of the data's precision: below
    it a pivot is rounding noise);
