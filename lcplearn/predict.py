@@ -184,11 +184,11 @@ def _draw(inputs: Inputs, trajectory: Trajectory, dt: float) -> Any:
         ("velocity [m/s]", trajectory.velocities[..., 0]),
         ("position [m]", trajectory.positions[..., 0]),
     ]
+    time = torch.arange(trajectory.positions.shape[-2]) * dt
     for ax, (label, values) in zip(figure.subplots(3, 1, sharex=True), rows, strict=True):
         series = values.reshape(-1, values.shape[-1])
-        time = torch.arange(series.shape[-1]) * dt
         for line in series[:10]:
-            ax.step(time, line, where="post") if label.startswith("force") else ax.plot(time, line)
+            ax.stairs(line, time, baseline=None, linewidth=1.5) if label.startswith("force") else ax.plot(time, line)
         ax.set_ylabel(label)
         ax.grid(alpha=0.3)
     ax.set_xlabel("time [s]")
