@@ -68,9 +68,9 @@ class Formulation(nn.Module):
         force: Float[Tensor, "*batch 1"],
         friction: Float[Tensor, "*batch 2"] | None = None,
     ) -> Float[Tensor, "*batch 2"]:
-        """Advance position [m] and velocity [m/s] by one step under a force [N]."""
-        position, velocity = state.unbind(-1)
-        velocity = self.next_velocity(velocity, force[..., 0], friction)
+        """Advance position [m] and velocity [m/s] by one step under a force [N], in float64 as all parameters are."""
+        position, velocity = state.double().unbind(-1)
+        velocity = self.next_velocity(velocity, force[..., 0].double(), None if friction is None else friction.double())
         return torch.stack((position + self.dt * velocity, velocity), dim=-1)
 
     def rollout(

@@ -276,6 +276,17 @@ def test_the_registry_names_every_model_of_the_comparison() -> None:
     assert list(FORMULATIONS) == names.split()
 
 
+@pytest.mark.parametrize("name", FORMULATIONS)
+def test_a_rollout_of_float32_data_is_that_of_the_same_numbers_in_float64(name: str) -> None:
+    model = FORMULATIONS[name](dt=DT)
+    state, forces = torch.tensor([0.0, 0.5]), torch.tensor([[0.0], [10.0], [-3.0]])
+    friction = torch.ones(3, 2) if model.needs_friction else None
+    path = model.rollout(state, forces, friction)
+    assert path.velocities.dtype == torch.float64
+    exact = model.rollout(state.double(), forces.double(), None if friction is None else friction.double())
+    assert torch.equal(path.velocities, exact.velocities)
+
+
 def test_wrong_arguments_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="dt"):
         Physical(dt=0.0)
