@@ -70,7 +70,10 @@ def residual(M: np.ndarray, q: np.ndarray, z: np.ndarray) -> Residual:
         d = np.ones_like(q)
         for _ in range(4):
             largest = (size * d).max(1) * d
-            d = np.where(largest > 0, d / np.sqrt(np.where(largest > 0, largest, 1)), d)
+            largest = np.where(largest > 0, largest, 1)
+            if (np.abs(largest - 1.3) <= 0.83).all():  # near enough to 1, as in `residuals.equilibrate`
+                break
+            d = d / np.sqrt(largest)
         w, omega = M @ z + q, np.abs(q) + np.abs(M) @ z
         w = np.where(np.abs(w) < TINY, 0, w)
         scale = np.abs(d * q).max()
