@@ -58,7 +58,7 @@ def pivoting_kernel() -> ModuleType | None:
 
 def as_array(x: Tensor, *shape: int) -> np.ndarray:
     """float64 array [*shape] on the tensor's memory; a copy only of what is not contiguous float64 already."""
-    return np.ascontiguousarray(x.numpy(), np.float64).reshape(shape)
+    return np.ascontiguousarray(x.resolve_neg().numpy(), np.float64).reshape(shape)
 
 
 def as_tensor(x: np.ndarray, like: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ def _solve_in_torch(M: Tensor, q: Tensor, options: Options) -> LCPSolution:
         exhausted=torch.zeros(count, dtype=torch.bool, device=q.device),
     )
     # q >= 0 is solved by z = 0 whatever M is.
-    todo = finite & ((q64 < 0).any(-1) | (smoothing > 0))
+    todo = finite & ((q64 < 0).any(-1) | (smoothing > 0 and n > 0))
     if todo.any():
         if method == "diagonal":
             found = _diagonal(M[todo], q64[todo])
