@@ -812,9 +812,9 @@ def _prepare_lemke(stage, single_precision, cover):
     The third try has an irregular vector: another path, without the old ray or cycle.
     """
     for i in range(cover.size):
-        cover[i] = 1.0 + (0.6180339887498949 * (i + 1)) % 1.0 if stage == 4 else 1.0
+        cover[i] = 1.0 + (0.6180339887498949 * (i + 1)) % 1.0 if stage == 5 else 1.0
     precision = 1e-6 if single_precision else 1e-9
-    return precision * (100.0 if stage == 4 else (1e-3 if stage == 5 else 1.0))
+    return precision * (100.0 if stage == 5 else (1e-3 if stage == 6 else 1.0))
 
 
 @_jit_inline
@@ -834,15 +834,15 @@ def _solve_one(
     """Run the cascade for one finite element with some q_i < 0; status, residual and iterations.
 
     Stages: 0 block pivoting, where it is the faster; 1 Lemke's method; 2 block pivoting from there, unless the residual
-    is that of rounding; 3, 4, 5 Lemke's method with rows and columns scaled apart; 6 interior point. What is infeasible
-    is found out when Lemke's method first ends on a ray.
+    is that of rounding; with rows and columns scaled apart 3 block pivoting and 4, 5, 6 Lemke's method; 7 interior
+    point. What is infeasible is found out when Lemke's method first ends on a ray.
     """
     n = q.size
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
     s = _scale(M, q, r, c, S, p)
     stage = -1 if warm or n < 6 or n > 40 else 0
-    while stage < 6 and not (accepted and (stage != 1 or best <= 1e-3 * tol)):
-        stage = 6 if capped else stage + 1
+    while stage < 7 and not (accepted and (stage != 1 or best <= 1e-3 * tol)):
+        stage = 7 if capped else stage + 1
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
             capped = True
@@ -850,9 +850,11 @@ def _solve_one(
         if stage == 3:
             _rescale(M, r, c)
             s = _scale(M, q, r, c, S, p)
-        if stage == 0 or stage == 2:
+            for i in range(n):
+                basis[i] = p[i] < 0.0
+        if stage == 0 or stage == 2 or stage == 3:
             ended, count = _block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left))
-        elif stage < 6:
+        elif stage < 7:
             pivot = _prepare_lemke(stage, single_precision, cover)
             cap = left if budget >= 0 else 10 * n + 50
             ended, count = _lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
@@ -868,7 +870,7 @@ def _solve_one(
                 basis[i] = z[i] > w[i]
             _polish(S, p, basis, T, place, False, A, rows, cols, index, z, w, omega, x, y)
         used += count
-        if (stage == 0 or stage == 2) and ended != DONE:
+        if (stage == 0 or stage == 2 or stage == 3) and ended != DONE:
             continue
         residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
         if residual > limit and _drop_noise(z, w, omega, S, tol):
