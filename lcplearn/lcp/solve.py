@@ -42,7 +42,7 @@ def solve_lcp(
         smoothing: tau >= 0. Above 0 the solution is the point of the central path with z_i w_i = tau: value and
             gradient are both smooth in (M, q), and both biased.
         initial_basis: Where pivoting starts, for example the basis of the step before in a rollout. Off by default,
-            since it chooses among the solutions of a problem that has several.
+            since it chooses among the solutions of a problem that has several. Unused where "auto" does not pivot.
         throw: Raise `LCPError` naming the elements that are not SOLVED.
 
     Returns:
@@ -88,14 +88,19 @@ def check_options(method: str, tol: float | None, max_iter: int | None, smoothin
     """Raise ValueError for options that no problem could use."""
     if method not in get_args(Method):
         raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
-    if tol is not None and not 0 < tol < math.inf:
+    if tol is not None and not (_is_number(tol) and 0 < tol < math.inf):
         raise ValueError(f"tol must be positive and finite, or None; got {tol!r}")
-    if max_iter is not None and (not isinstance(max_iter, int) or max_iter < 1):
+    if max_iter is not None and not (type(max_iter) is int and 0 < max_iter < 2**63):
         raise ValueError(f"max_iter must be a positive integer, or None; got {max_iter!r}")
-    if not 0 <= smoothing < math.inf:
+    if not (_is_number(smoothing) and 0 <= smoothing < math.inf):
         raise ValueError(f"smoothing must be finite and at least 0; got {smoothing!r}")
     if smoothing > 0 and method not in ("auto", "interior_point"):
         raise ValueError(f"smoothing needs method 'interior_point' or 'auto'; got method {method!r}")
+
+
+def _is_number(x: object) -> bool:
+    """Whether x is an int or a float, and not, say, a tensor, whose gradient would be dropped silently."""
+    return isinstance(x, (int, float)) and not isinstance(x, bool)
 
 
 def _check_tensors(M: Tensor, q: Tensor, initial_basis: Tensor | None) -> torch.Size:
@@ -103,6 +108,8 @@ def _check_tensors(M: Tensor, q: Tensor, initial_basis: Tensor | None) -> torch.
     for name, x in (("M", M), ("q", q)):
         if not isinstance(x, Tensor):
             raise ValueError(f"{name} must be a torch.Tensor; got {type(x).__name__}")
+        if x.layout is not torch.strided:
+            raise ValueError(f"{name} must be dense; got {x.layout}")
         if x.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{name} must be float32 or float64; got {x.dtype}")
     if M.dtype != q.dtype or M.device != q.device:
@@ -112,14 +119,20 @@ def _check_tensors(M: Tensor, q: Tensor, initial_basis: Tensor | None) -> torch.
     if q.dim() < 1 or q.shape[-1] != M.shape[-1]:
         raise ValueError(f"q must have shape [*batch, {M.shape[-1]}] to match M {list(M.shape)}; got {list(q.shape)}")
     batch = _broadcast(M.shape, q.shape)
-    if initial_basis is not None and (
-        initial_basis.dtype != torch.bool or initial_basis.shape not in (q.shape, (*batch, q.shape[-1]))
-    ):
-        expected = [*batch, q.shape[-1]]
-        raise ValueError(
-            f"initial_basis must be bool of shape {expected}; got {initial_basis.dtype} {list(initial_basis.shape)}"
-        )
+    if initial_basis is not None:
+        _check_basis(initial_basis, q, [*batch, q.shape[-1]])
     return batch
+
+
+def _check_basis(basis: Tensor, q: Tensor, shape: list[int]) -> None:
+    """Raise ValueError for an initial basis that is not a bool for each unknown."""
+    if not isinstance(basis, Tensor):
+        found = type(basis).__name__
+    elif basis.dtype != torch.bool or basis.device != q.device or list(basis.shape) not in (list(q.shape), shape):
+        found = f"{basis.dtype} {list(basis.shape)} on {basis.device}"
+    else:
+        return
+    raise ValueError(f"initial_basis must be a bool tensor of shape {shape} on {q.device}; got {found}")
 
 
 def _broadcast(M_shape: torch.Size, q_shape: torch.Size) -> torch.Size:

@@ -284,6 +284,19 @@ def test_summary_counts_statuses_and_kinks():
         (lambda M, q: solve_lcp(M, q, smoothing=-1.0), "smoothing must be finite"),
         (lambda M, q: solve_lcp(M, q, smoothing=0.1, method="diagonal"), "smoothing needs method"),
         (lambda M, q: LCPLayer(method="newton"), "method must be one of"),
+        (lambda M, q: solve_lcp(M.to_sparse(), q), "M must be dense; got torch.sparse_coo"),
+        (lambda M, q: solve_lcp(M, q, tol=torch.tensor(1e-9)), "tol must be positive"),
+        (lambda M, q: solve_lcp(M, q, max_iter=2**63), "max_iter must be a positive integer"),
+        (lambda M, q: solve_lcp(M, q, smoothing=torch.tensor(0.1)), "smoothing must be finite"),
+        (lambda M, q: solve_lcp(M, q, smoothing=None), "smoothing must be finite"),
+        (lambda M, q: solve_lcp(M, q, initial_basis=[True] * 3), r"initial_basis must be a bool .* got list"),
+        (
+            lambda M, q: solve_lcp(M, q, initial_basis=q),
+            r"initial_basis must be a bool .* got torch.float64 \[3\] on cpu",
+        ),
+        (lambda M, q: solve_lcp(M, q, initial_basis=q[:2] > 0), r"of shape \[3\] on cpu; got torch.bool \[2\]"),
+        (lambda M, q: solve_lcp(M, q, initial_basis=(q > 0).to("meta")), r"on cpu; got torch.bool \[3\] on meta"),
+        (lambda M, q: solve_lcp(M, q, initial_basis=q > 0, method="diagonal"), "initial_basis needs method 'pivoting'"),
     ],
 )
 def test_wrong_argument_raises_a_value_error_that_names_it(call, message):

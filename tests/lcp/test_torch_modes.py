@@ -92,7 +92,7 @@ def test_modes_without_gradients_give_the_same_values(mode, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("transform", ["transposed", "strided", "expanded", "one shared"])
+@pytest.mark.parametrize("transform", ["transposed", "strided", "expanded", "one shared", "negated lazily"])
 def test_unusual_memory_is_read_right_and_never_written(method, transform):
     M, q = problem()
     if transform == "transposed":
@@ -101,6 +101,9 @@ def test_unusual_memory_is_read_right_and_never_written(method, transform):
         M, q = torch.stack([M, -M], -1)[..., 0], torch.stack([q, -q], -1)[..., 0]
     elif transform == "expanded":
         M, q = M[0].expand(3, 4, 4), q[0].expand(3, 4)
+    elif transform == "negated lazily":
+        M, q = (torch.complex(x, -x).conj().imag for x in (M, q))
+        assert M.is_neg()
     else:
         M = M[:1]
     M, q = M.requires_grad_(), q.requires_grad_()
