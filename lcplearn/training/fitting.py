@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
 import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
@@ -108,7 +109,7 @@ def fit(
     folder = _new_folder(folder)
     _quiet()
     batches, validation = windows(data.train, horizon), windows(data.validation, horizon)
-    loss_terms(model, _first(batches), loss)  # refuses what doesn't fit before anything is written
+    _try_once(model, _first(batches), loss)
     loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
     chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
     every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
@@ -141,6 +142,12 @@ def fit(
     if last.stopped:
         raise TrainingInterrupted(last.path)
     return _finish(lightning_trainer, module, best, data, folder, seconds_before + time.perf_counter() - start)
+
+
+def _try_once(model: Formulation, window: Windows, loss: Mapping[str, float]) -> None:
+    """Refuse what doesn't fit before anything is written, and compile the solver before the clock starts."""
+    torch.stack([*loss_terms(model, window, loss).values()]).sum().backward()
+    model.zero_grad()
 
 
 def _finish(
