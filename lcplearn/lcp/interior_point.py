@@ -84,7 +84,9 @@ class _Best(NamedTuple):
         """Take points that are better than those held, their zeros made exact; returns their residual."""
         basis = basis & (z > 0)
         z = torch.where(basis, z, 0.0)
-        w = torch.where(basis, 0.0, _multiply(S, z) + p).clamp_min(0)
+        w = _multiply(S, z) + p
+        noise = 8 * EPS * (p.abs() + _multiply(S.abs(), z))
+        w = torch.where(basis | (w <= noise), 0.0, w)
         error = judge(S, p, z, tol=EXACT).residual
         better = error < self.error[index]
         for held, offered in zip(self, (z, w, basis, error), strict=True):

@@ -818,11 +818,11 @@ def _prepare_lemke(stage, single_precision, cover):
 
 
 @_jit_inline
-def _write(z, w, basis, c, s, r, z_out, w_out, basis_out):
-    """Put a scaled solution into the caller's arrays, with exact zeros."""
+def _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
+    """Put a scaled solution into the caller's arrays, with exact zeros, also where w is rounding noise."""
     for i in range(z.size):
         z_out[i] = c[i] * s * z[i] if basis[i] else 0.0
-        w_out[i] = 0.0 if basis[i] else max(w[i], 0.0) * s / r[i]
+        w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s / r[i]
         basis_out[i] = basis[i] != 0
 
 
@@ -878,7 +878,7 @@ def _solve_one(
             residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
         if residual < best:
             best, accepted = residual, residual <= limit
-            _write(z, w, basis, c, s, r, z_out, w_out, basis_out)
+            _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
         if ended == STUCK and not asked and not accepted:
             asked = True
             if _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, 20 * n + 50):

@@ -269,6 +269,18 @@ def test_gradient_at_a_kink_is_that_of_one_of_its_two_sides(method):
     assert distance.amax(0).max() > 1e-3  # the sides do differ
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_kink_is_seen_where_every_other_member_is_basic(method):
+    """Only the kink's own w is left to compare it with: rounding noise there is zero."""
+    generator = torch.Generator().manual_seed(0)
+    M = random_family("nonsymmetric definite", 64, 4, generator)
+    z = torch.rand(64, 4, generator=generator) + 0.1
+    z[:, 0] = 0.0
+    solution = solve_lcp(M, -(M @ z.unsqueeze(-1)).squeeze(-1), method=method)
+    assert not solution.w.any()
+    assert torch.equal(solution.degenerate, torch.arange(4).expand(64, 4) == 0)
+
+
 def test_smoothed_gradient_is_finite_where_a_member_of_the_central_path_rounds_to_zero():
     """w / z is infinite there: the member counts as nonbasic, as it is in the limit."""
     q = torch.tensor([1e30, -1.0]).float().requires_grad_()
