@@ -16,6 +16,7 @@ q + M z comes out as exactly 0 if q is added first.
 
 With smoothing tau the condition z_i w_i = tau replaces z_i w_i = 0, and its smoothed minimum replaces min: the root
 s(z, w) = (z + w - sqrt((z - w)^2 + 4 tau)) / 2 is zero exactly where z, w > 0 and z w = tau (Chen-Harker-Kanzow-Smale).
+The size of q in (a) is then at least sqrt(tau), that of z~ and w~ for q = 0.
 """
 
 from typing import NamedTuple
@@ -98,7 +99,7 @@ def judge(
     absMz = (M.abs() @ z.abs().unsqueeze(-1)).squeeze(-1)
     w = Mz + q
     d = equilibrate(M)
-    q_size = (d * q).abs().amax(-1).clamp_min(TINY)
+    q_size = (d * q).abs().amax(-1).clamp_min(max(TINY, smoothing**0.5))
     natural = smoothed_minimum(z / d, d * w, smoothing).abs().amax(-1)
     z_size = z.abs().amax(-1, keepdim=True).clamp_min(TINY)
     omega = q.abs() + absMz

@@ -251,6 +251,14 @@ def test_smoothed_solution_lies_on_the_central_path_and_tends_to_the_solution():
         assert (smoothed.z - z).abs().max() < 300 * tau
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e-12, 1.0])
+def test_smoothed_problem_is_solved_however_small_its_q(size):
+    tau, m, q = 0.04, torch.tensor([1.0, 4.0, 100.0]), size * torch.tensor([1.0, -1.0, 0.5])
+    solution = solve_lcp(torch.diag(m), q, smoothing=tau)
+    assert solution.solved
+    torch.testing.assert_close(solution.z, (-q + (q.square() + 4 * m * tau).sqrt()) / (2 * m), rtol=1e-12, atol=0)
+
+
 def test_limit_on_iterations_is_reported_as_such():
     generator = torch.Generator().manual_seed(6)
     M = random_family("condition 1e10", 4, 50, generator)
