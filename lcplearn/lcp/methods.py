@@ -103,6 +103,8 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
 
 def _solve_in_torch(M: Tensor, q: Tensor, options: Options) -> LCPSolution:
     """Flatten the batch, set aside what needs no solver, run the method, judge."""
+    if q.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"M and q must be on the CPU or a CUDA device, which have float64; got {q.device}")
     method, tol, max_iter, smoothing = options
     shape, n = q.shape, q.shape[-1]
     count = math.prod(shape[:-1])

@@ -149,3 +149,10 @@ def test_without_numba_auto_warns_once_and_solves_by_interior_point(monkeypatch)
 def test_pivoting_refuses_other_devices():
     with pytest.raises(ValueError, match="'pivoting' runs on the CPU; got M and q on meta"):
         solve_lcp(torch.eye(2, device="meta"), torch.ones(2, device="meta"), method="pivoting")
+
+
+@pytest.mark.parametrize("method", ["auto", "diagonal", "interior_point"])
+def test_devices_without_float64_are_refused(method):
+    """The meta device stands in for Apple's."""
+    with pytest.raises(ValueError, match="must be on the CPU or a CUDA device, which have float64; got meta"):
+        solve_lcp(torch.eye(2, device="meta"), torch.ones(2, device="meta"), method=method)
