@@ -426,6 +426,7 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
     n = q.size
     smallest = TINY / s if s < 1e-150 else 0.0  # not a denormal, with which arithmetic is slow
     z_size, q_size, natural, noise, rows, absMz, absq, total = smallest, smallest, 0.0, 0.0, 0.0, 0.0, TINY, 0.0
+    lost = False  # q spans more than the range of doubles: its small rows are not in p, and nobody has solved them
     for i in range(n):
         z_size = max(z_size, c[i] * z[i])
     for i in range(n):
@@ -437,11 +438,12 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
         rows = max(rows, abs(min(c[i] * z[i] / z_size if z[i] > 0.0 else 0.0, w_share)))
         absMz = max(absMz, (omega[i] - abs(p[i])) / r[i])
         absq = max(absq, abs(q[i]))
+        lost = lost or (abs(p[i]) < TINY and q[i] != 0.0 and s > 2.0 * TINY)
         total += abs(w[i]) * s / r[i] + c[i] * s * z[i]
     residual = max(natural / q_size, rows)
     if noise > 1e-6 * q_size:
         residual = max(residual, noise / q_size)
-    if not total <= LARGEST:
+    if lost or not total <= LARGEST:
         residual = np.inf
     return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))
 
@@ -842,7 +844,7 @@ def _solve_one(
     s = _scale(M, q, r, c, S, p)
     stage = -1 if warm or n < 6 or n > 40 else 0
     while stage < 7 and not (accepted and (stage != 1 or best <= 1e-3 * tol)):
-        stage = 7 if capped else stage + 1
+        stage = 7 if capped and (budget >= 0 or stage >= 4) else stage + 1
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
             capped = True
