@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from lcp.oracles import has_solution
 
-from lcplearn import LCPError, Status, solve_lcp
+from lcplearn import LCPError, LCPLayer, Status, solve_lcp
 
 
 def proves_infeasibility(M: torch.Tensor, q: torch.Tensor, u: torch.Tensor) -> bool:
@@ -59,3 +59,20 @@ def test_summary_shares_add_up_and_hold_plain_numbers():
     assert sum(summary[f"{status.name.lower()}_share"] for status in Status) == 1
     assert (summary["infeasible_share"], summary["degenerate_share"]) == (0.25, 0.25)
     assert all(type(value) is float for value in summary.values())
+
+
+def test_throw_names_the_elements_and_the_reason():
+    M, q = torch.eye(1).expand(3, 1, 1).clone(), torch.tensor([[-1.0], [torch.nan], [-1.0]])
+    M[2] = -1
+    with pytest.raises(LCPError, match=r"2 of 3 .*\(1,\), \(2,\).*NONFINITE_INPUT"):
+        LCPLayer(throw=True)(M, q)
+
+
+def test_summary_counts_statuses_and_kinks():
+    M = torch.eye(2).expand(4, 2, 2).clone()
+    q = torch.tensor([[-1.0, 1.0], [0.0, -1.0], [1.0, 1.0], [torch.nan, 0.0]])
+    summary = solve_lcp(M, q).summary()
+    assert summary["solved_share"] == 0.75
+    assert summary["nonfinite_input_share"] == 0.25
+    assert summary["degenerate_share"] == 0.25
+    assert summary["worst_residual"] <= 1e-15
