@@ -25,7 +25,7 @@ def full_lcp(
     Returns:
         M and q.
 
-    Source: Stewart and Trinkle 1996; architecture.md section 4.
+    Source: Stewart and Trinkle 1996.
     """
     a = 1.0 / mass
     M = torch.tensor(

@@ -60,7 +60,7 @@ def _solvable_families() -> list[HardCase]:
     for bodies in (3, 4):
         for ratio in (10.0, 1e2, 1e3, 1e4):
             problem = mass_ratio_stack(bodies, ratio)
-            # peers.md asks for 1e-8 up to ratio 1e3; with 4 bodies M itself is not known that well then
+            # 1e-8 up to ratio 1e3; with 4 bodies M itself is not known that well then
             tolerance = max(1e-8, _rounding(problem.M[0]))
             name, text = f"{bodies} bodies 1:{ratio:g}", f"relative error of z {tolerance:.0e}"
             cases.append(_solvable("mass-ratio stack", name, problem, text, tolerance))

@@ -148,7 +148,7 @@ def stick_share(form: str, push: str, entries: str, sigma: float, *, samples: in
     Returns:
         sticks (|v| < 1e-12 m/s), nearly_sticks (|v| < 1e-3 m/s), solved and median_speed [m/s], with the arguments.
 
-    Source: LCP Notes 3.2; learning.md B3; errata 27.
+    Source: LCP Notes 3.2; errata 27.
     """
     generator = torch.Generator().manual_seed(seed)
     size = 0.1 + 0.8 * torch.rand(samples, generator=generator, dtype=torch.float64)

@@ -31,7 +31,7 @@ def _orthogonal(rng: np.random.Generator, B: int, n: int) -> np.ndarray:
     return np.linalg.qr(rng.standard_normal((B, n, n)))[0]
 
 
-# --- random families of peers.md ------------------------------------------------------------------------------------
+# --- random families -------------------------------------------------------------------------------------------------
 
 
 def sliding_block_direct(rng: np.random.Generator, B: int) -> Problems:

@@ -208,7 +208,7 @@ def _method_row(method: str, cases: Sequence[Row], counts: Counter) -> tuple[Any
 
 
 def _noise_table(noise: Sequence[Row]) -> Table:
-    """Ranges over sigma, as in learning.md B3."""
+    """Ranges over sigma."""
     rows = []
     for form in noise_study.FORMS:
         cells: list[Any] = [form]

@@ -54,7 +54,7 @@ def loss_terms(model: Formulation, windows: Windows, weights: Mapping[str, float
     Raises:
         ValueError: an unknown term, a negative weight, a term that the model doesn't have, or missing friction.
 
-    Source: notes section 3.1.1 (cost c, squared: errata 19); learning.md B2 (violation).
+    Source: notes section 3.1.1 (cost c, squared: errata 19); NOTES 6 (violation).
     """
     for name, weight in weights.items():
         if name not in _TERMS:
@@ -160,7 +160,7 @@ def violation(
     Gradient:
         With respect to r and l, at fixed y: the derivative through the minimiser vanishes (envelope theorem).
 
-    Source: learning.md B2.
+    Source: NOTES 6, losses.
     """
     gate = (after.abs() / VIOLATION_WIDTH).clamp(max=1.0)
     sliding = -torch.sign(after) * limit

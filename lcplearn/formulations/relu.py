@@ -28,7 +28,7 @@ class ReLU(Formulation):
         width: Units of a hidden layer.
         depth: Hidden layers below the rectified outputs; 0 makes them affine in (v, u dt).
 
-    Source: notes Remark 4; learning.md B2.
+    Source: notes Remark 4; NOTES 6.
     """
 
     def __init__(self, *, dt: float, gravity: float = 9.81, width: int = 64, depth: int = 0) -> None:

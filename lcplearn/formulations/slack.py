@@ -17,7 +17,7 @@ class Slack(KnownFriction):
     slacks are positive both velocities are exactly zero, with any f and G: the block sticks. Where G is not a P-matrix
     the LCP may have no solution; `last_solution` says so.
 
-    Source: notes section 3.1.2; errata 20, 21; learning.md B2.
+    Source: notes section 3.1.2; errata 20, 21; NOTES 6.
     """
 
     def __init__(self, *, dt: float, gravity: float = 9.81) -> None:

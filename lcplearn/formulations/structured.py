@@ -22,7 +22,7 @@ class FrictionLCP(Formulation):
             replaces (v+, v-): its gradient with respect to c is nowhere zero, so training may start with it where no
             sample is predicted to slip (the plateau) and anneal it to 0. Predictions are made at 0.
 
-    Source: notes section 3.2; learning.md B3.
+    Source: notes section 3.2; NOTES 6.
     """
 
     def __init__(self, *, dt: float, gravity: float = 9.81) -> None:

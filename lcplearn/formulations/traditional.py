@@ -27,7 +27,7 @@ class FreeLCP(Formulation):
         initial_mu: Friction coefficient at the start; > 0.
         initial_noise: Standard deviation of the noise on the initial entries of f and G; >= 0.
 
-    Source: notes sections 2.5 and 3.1.3; errata 22-26; learning.md B3.
+    Source: notes sections 2.5 and 3.1.3; errata 22-26; NOTES 6.
     """
 
     def __init__(

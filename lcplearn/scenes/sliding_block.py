@@ -28,7 +28,7 @@ def slide(p: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"] | float) -> F
 
     Gradient: With respect to p and c; at the kink |p| = c that of sticking, 0.
 
-    Source: NOTES, two-way sliding; learning.md, finding 1.
+    Source: NOTES 5.4.
     """
     return torch.relu(p - c) - torch.relu(-p - c)
 

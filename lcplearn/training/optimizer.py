@@ -23,7 +23,7 @@ class Optimizer:
     Raises:
         ValueError: a value out of range.
 
-    Source: learning.md B1; B2 (gradient plateau).
+    Source: NOTES, sections 6 (the plateau) and 7.
     """
 
     lr: float = 5e-2

@@ -27,7 +27,7 @@ def same(one: BlockData, other: BlockData) -> bool:
 
 
 def test_sliding_recordings_have_the_default_sizes_and_the_truth():
-    """learning.md B1: 20 x 100 to train on, 40 x 100 for one step, 20 x 1000 for rollouts."""
+    """20 x 100 to train on, 40 x 100 for one step, 20 x 1000 for rollouts."""
     data = simulate_sliding_block()
     assert [tuple(part.forces.shape) for part in splits(data)] == [(20, 100), (10, 100), (40, 100), (20, 1000)]
     assert all(part.velocities.shape[1] == part.positions.shape[1] == part.forces.shape[1] + 1 for part in splits(data))
@@ -58,7 +58,7 @@ def test_the_size_of_the_training_set_does_not_change_the_test_sets():
 
 
 def test_measurement_noise_is_on_velocities_to_learn_from_only():
-    """learning.md B1: the tests are free of noise."""
+    """The tests are free of noise."""
     data = simulate_sliding_block(trajectories=200, noise=0.05)
     error = data.train.velocities - data.train.true_velocities
     assert error.std().item() == pytest.approx(0.05, rel=0.03)
@@ -92,7 +92,6 @@ def test_the_time_at_rest_can_be_asked_for(share):
 
 
 def test_the_default_force_rests_about_two_fifths_of_the_time():
-    """learning.md B1: 39-45 %."""
     assert share_at_rest(simulate_sliding_block(trajectories=400).train) == pytest.approx(0.42, abs=0.04)
 
 

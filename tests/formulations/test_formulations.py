@@ -134,7 +134,7 @@ def disturbed(model: Formulation, scale: float) -> Formulation:
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e-2])
 @pytest.mark.parametrize("model", [true_slack, true_relu, true_structured, true_physical])
 def test_sticking_survives_noise_on_the_parameters_of_a_structured_model(model, scale: float) -> None:
-    """learning.md B3: noise on (a, b, c) leaves exact zeros, up to the few samples that it moves over the limit."""
+    """NOTES 6: noise on (a, b, c) leaves exact zeros, up to the few samples that it moves over the limit."""
     shares = []
     for _ in range(10):
         predicted = disturbed(model(), scale).next_velocity(*sticking_samples(200))

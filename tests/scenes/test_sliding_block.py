@@ -38,7 +38,7 @@ def paths(random_pushes) -> dict[str, Trajectory]:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_all_forms_give_the_closed_form_velocity_on_30000_random_steps(form, random_pushes, paths):
-    """Notes 2.5 against 2.2; learning.md, finding 1. The mode has to agree too: sticking is exactly zero velocity."""
+    """Notes 2.5 against 2.2; NOTES 5.6. The mode has to agree too: sticking is exactly zero velocity."""
     start, forces = random_pushes
     path, velocity = paths[form], start[:, 1]
     for k in range(forces.shape[1]):
