@@ -38,4 +38,5 @@ class LCPLayer(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        return f"method={self.method!r}, tol={self.tol}, max_iter={self.max_iter}, smoothing={self.smoothing}"
+        names = ("method", "tol", "max_iter", "smoothing", "throw")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
