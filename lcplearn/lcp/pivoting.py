@@ -879,8 +879,8 @@ def _solve_one(
             _evaluate(S, p, z, w, omega)
             residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
         if residual < best:
-            best, accepted = residual, residual <= limit
             _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
+            best, accepted = residual, residual <= limit and _all_finite(z_out) and _all_finite(w_out)
         if ended == STUCK and not asked and not accepted:
             asked = True
             if _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, 20 * n + 50):

@@ -16,7 +16,8 @@ q + M z comes out as exactly 0 if q is added first.
 
 With smoothing tau the condition z_i w_i = tau replaces z_i w_i = 0, and its smoothed minimum replaces min: the root
 s(z, w) = (z + w - sqrt((z - w)^2 + 4 tau)) / 2 is zero exactly where z, w > 0 and z w = tau (Chen-Harker-Kanzow-Smale).
-The size of q in (a) is then at least sqrt(tau), that of z~ and w~ for q = 0.
+The size of q in (a) is then at least sqrt(tau), that of z~ and w~ for q = 0; in (b) |w_i - tau / z_i| takes the place
+of w_i, since without a central path (M = 0, q = 0) z grows until (a) no longer sees that w_i = 0.
 """
 
 from typing import NamedTuple
@@ -71,9 +72,9 @@ def two_sided_scales(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*ba
     return rows, columns
 
 
-def smoothed_minimum(a: Tensor, b: Tensor, tau: Tensor | float) -> Tensor:
+def smoothed_minimum(a: Tensor, b: Tensor, tau: float) -> Tensor:
     """min(a, b), or for tau > 0 the root that is zero where a b = tau, written without cancellation near it."""
-    if not isinstance(tau, Tensor) and tau == 0:
+    if tau == 0:
         return torch.minimum(a, b)
     root = torch.sqrt((a - b).square() + 4 * tau)
     return torch.where(a + b > 0, 2 * (a * b - tau) / (a + b + root), (a + b - root) / 2)
@@ -103,9 +104,8 @@ def judge(
     natural = smoothed_minimum(z / d, d * w, smoothing).abs().amax(-1)
     z_size = z.abs().amax(-1, keepdim=True).clamp_min(TINY)
     omega = q.abs() + absMz
-    product = z_size * omega
-    tau = torch.where(product > 0, smoothing / product, 0.0) if smoothing else 0.0
-    rows = smoothed_minimum(z / z_size, w / omega.clamp_min(TINY), tau).abs().amax(-1)
+    off_path = (w - smoothing / z.clamp_min(TINY)).abs() if smoothing else w
+    rows = torch.minimum(z / z_size, off_path / omega.clamp_min(TINY)).abs().amax(-1)
     residual = torch.maximum(natural / q_size, rows)
     noise = torch.where(w.abs() <= 8 * EPS * omega, EPS * d * omega, 0.0).amax(-1) / q_size
     residual = torch.where(noise > 1e-6, torch.maximum(residual, noise), residual)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lcplearn import solve_lcp
 from lcplearn.benchmark import problems
 from lcplearn.lcp import pivoting
 from lcplearn.lcp.residuals import equilibrate, judge
@@ -93,3 +94,13 @@ def test_equilibrated_matrix_has_rows_of_size_one_within_a_factor_of_three():
     d = equilibrate(M)
     largest = (d.unsqueeze(-1) * M * d.unsqueeze(-2)).abs().amax(-1)
     assert ((largest > 1 / 3) & (largest < 3)).all()
+
+
+def test_without_a_central_path_smoothing_is_never_solved():
+    """M = 0, q = 0: z w = tau and w = 0 contradict each other."""
+    for dtype in (torch.float32, torch.float64):
+        M, q = torch.zeros(2, 2, dtype=dtype).requires_grad_(), torch.zeros(2, dtype=dtype).requires_grad_()
+        solution = solve_lcp(M, q, smoothing=1e-3)
+        assert not solution.solved
+        solution.z.sum().backward()
+        assert not M.grad.any()
