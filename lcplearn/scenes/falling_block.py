@@ -8,11 +8,11 @@ from torch import Tensor
 
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.checks import require_positive
-from lcplearn.scenes.rollout import Mode, Trajectory, rollout
+from lcplearn.scenes.rollout import Block, Mode
 
 
 @dataclass(frozen=True)
-class FallingBlock:
+class FallingBlock(Block):
     """A block that falls, lands without penetrating and stays.
 
     0 <= x_{k+1} ⟂ lambda = (m/dt^2) x_{k+1} - (m/dt^2) (x_k + dt v_k + dt^2 (u/m - g)) >= 0, one row.
@@ -25,7 +25,7 @@ class FallingBlock:
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2]. Number or tensor that broadcasts over the batch.
 
-    Source: LCP Notes 1; errata 1 and "Falling block with impact". Differs: 1. general mass and an external force.
+    Source: LCP Notes 1; errata 1; NOTES 5.1. Differs: 1. general mass and an external force.
     """
 
     mass: float | Tensor
@@ -69,20 +69,12 @@ class FallingBlock:
         mode = torch.where(next_gap > 0, int(Mode.SEPARATION), int(Mode.STICK))
         return torch.stack((next_gap, next_velocity), dim=-1), mode.unsqueeze(-1)
 
-    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
-        """Next state: gap [m] and upward velocity [m/s]."""
-        return self.advance(state, force)[0]
-
-    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
-        """Trajectory over T forces [N] from a state."""
-        return rollout(self.advance, state, forces)
-
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + self.dt * (force / self.mass - self.gravity)
 
 
 @dataclass(frozen=True)
-class BouncingBlock:
+class BouncingBlock(Block):
     """A block that falls and bounces off the ground.
 
     0 <= v_{k+1} + e v_k ⟂ lambda = (m/dt) (v_{k+1} - v_k) - u + m g >= 0 where x_k + dt v_k <= 0, else lambda = 0.
@@ -96,7 +88,7 @@ class BouncingBlock:
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2].
 
-    Source: errata, "Falling block with impact"; Moreau 1988.
+    Source: NOTES 5.2; Moreau 1988.
     """
 
     mass: float | Tensor
@@ -125,14 +117,6 @@ class BouncingBlock:
         )
         mode = torch.where(in_contact, int(Mode.STICK), int(Mode.SEPARATION))
         return torch.stack((gap + self.dt * next_velocity, next_velocity), dim=-1), mode.unsqueeze(-1)
-
-    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
-        """Next state: gap [m] and upward velocity [m/s]."""
-        return self.advance(state, force)[0]
-
-    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
-        """Trajectory over T forces [N] from a state."""
-        return rollout(self.advance, state, forces)
 
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + self.dt * (force / self.mass - self.gravity)

@@ -69,3 +69,19 @@ def rollout(
     # The first state lacks the dimensions that the scene's own batched parameters add.
     path = torch.stack(torch.broadcast_tensors(*states), dim=-2)
     return Trajectory(path[..., :-nv], path[..., -nv:], torch.stack(torch.broadcast_tensors(*modes), dim=-2))
+
+
+class Block:
+    """A block with one position and one velocity, and a method `advance`: what its step and rollout are."""
+
+    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
+        """Next state [*batch, 2] and contact mode [*batch, 1]."""
+        raise NotImplementedError
+
+    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
+        """Next state: position or gap [m], and velocity [m/s], under a force [N]."""
+        return self.advance(state, force)[0]
+
+    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
+        """Trajectory over T forces [N] from a state."""
+        return rollout(self.advance, state, forces)

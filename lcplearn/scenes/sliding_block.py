@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.checks import require_positive
-from lcplearn.scenes.rollout import Mode, Trajectory, rollout
+from lcplearn.scenes.rollout import Block, Mode
 
 Form = Literal["direct", "physical", "traditional"]
 
@@ -34,7 +34,7 @@ def slide(p: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"] | float) -> F
 
 
 @dataclass(frozen=True)
-class OneWayBlock:
+class OneWayBlock(Block):
     """A block that friction can stop but nothing can push back.
 
     0 <= v_{k+1} ⟂ lambda' = (m/dt) v_{k+1} - (m/dt) v_k - u + mu m g >= 0, one row.
@@ -87,17 +87,9 @@ class OneWayBlock:
         """Next state [*batch, 2] and contact mode [*batch, 1]."""
         return _advance(state, self.next_velocity(state[..., 1], force[..., 0]), self.dt)
 
-    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
-        """Next state: position [m] and velocity [m/s]."""
-        return self.advance(state, force)[0]
-
-    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
-        """Trajectory over T forces [N] from a state."""
-        return rollout(self.advance, state, forces)
-
 
 @dataclass(frozen=True)
-class SlidingBlock:
+class SlidingBlock(Block):
     """A block that slides both ways under dry friction and sticks exactly.
 
     v_{k+1} = S(p, c) with p = v_k + u dt/m and c = mu g dt, from one of three LCPs:
@@ -177,14 +169,6 @@ class SlidingBlock:
     def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
         """Next state [*batch, 2] and contact mode [*batch, 1]."""
         return _advance(state, self.next_velocity(state[..., 1], force[..., 0]), self.dt)
-
-    def step(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "... 2"]:
-        """Next state: position [m] and velocity [m/s]."""
-        return self.advance(state, force)[0]
-
-    def rollout(self, state: Float[Tensor, "*#batch 2"], forces: Float[Tensor, "*#batch T 1"]) -> Trajectory:
-        """Trajectory over T forces [N] from a state."""
-        return rollout(self.advance, state, forces)
 
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + force * self.dt / self.mass
