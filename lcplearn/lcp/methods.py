@@ -51,7 +51,7 @@ def pivoting_kernel() -> ModuleType | None:
     try:
         from lcplearn.lcp import pivoting
     except ImportError as error:
-        warnings.warn(f"solving by interior point, many times slower on the CPU: {error}", stacklevel=2)
+        warnings.warn(f"solving in torch (interior point, many times slower) on the CPU: {error}", stacklevel=2)
         return None
     return pivoting
 

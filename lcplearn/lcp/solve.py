@@ -33,7 +33,8 @@ def solve_lcp(
     Args:
         M, q: float32 or float64, of one dtype and device; batch dimensions broadcast, n may be 0. The arithmetic is
             float64 throughout; results come back in the caller's dtype.
-        method: "diagonal" is the closed form z = max(0, -q / diag M) for M that the caller knows to be diagonal;
+        method: "diagonal" is the closed form z = max(0, -q / diag M) for M that the caller knows to be diagonal (one
+            that is not is solved by pivoting on the CPU, and never wrongly SOLVED elsewhere);
             "pivoting" is the CPU kernel (first call ever: 10-20 s of compilation); "interior_point" runs on any
             device; "auto" is pivoting on the CPU and interior_point elsewhere and for smoothing.
         tol: Largest residual (see `residuals.py`) that counts as solved; by default 1e-10 for float64 and 2e-6 for

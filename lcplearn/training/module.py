@@ -53,8 +53,6 @@ class FormulationModule(pl.LightningModule):
         self.started = time.perf_counter()
 
     def on_train_epoch_start(self) -> None:
-        if self.trainer.train_dataloader is not None:
-            self.trainer.train_dataloader.set_epoch(self.current_epoch)
         adam = self._optimizers()[0]
         for group in adam.param_groups:
             group["lr"] = self.optimizer.learning_rate(self.current_epoch, self.trainer.max_epochs or 1)
