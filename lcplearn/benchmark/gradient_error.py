@@ -18,7 +18,6 @@ import torch
 
 from lcplearn import solve_lcp
 from lcplearn.benchmark.problems import Problems
-from lcplearn.lcp import pivoting
 
 STEP = 4e-3  # relative to the data: truncation (of sixth order) and rounding (eps * condition / STEP) both stay small
 AGREEMENT = 1e-7
@@ -88,8 +87,8 @@ def reference(family: str, problems: Problems, seed: int) -> Reference:
 
     def unique(t: float) -> np.ndarray:
         at = M * (1 + t * path.F) * (1 + t * path.H), q + t * path.dq
-        result = pivoting.solve_batch(*at, single_precision=False, max_iter=None)
-        return np.where((result.status == pivoting.SOLVED)[:, None], (path.A @ result.z[..., None])[..., 0], np.nan)
+        result = solve_lcp(*map(torch.from_numpy, at))
+        return np.where(result.solved.numpy()[:, None], (path.A @ result.z.numpy()[..., None])[..., 0], np.nan)
 
     slopes = [((unique(h) - unique(-h)) * path.c).sum(1) / (2 * h) for h in (STEP, STEP / 2, STEP / 4, STEP / 8)]
     for order in (4, 16):

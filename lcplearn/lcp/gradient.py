@@ -22,9 +22,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
+from torch.autograd import forward_ad
 
-from lcplearn.lcp.methods import Options, as_array, as_tensor, pivoting_kernel, pivots, solve
+from lcplearn.lcp.methods import Options, pivoting_kernel, pivots, plain, solve
 from lcplearn.lcp.residuals import two_sided_scales
 from lcplearn.lcp.solution import LCPSolution, Status
 
@@ -94,10 +94,12 @@ class _TransformableSolve(torch.autograd.Function):
 
 
 def _save(ctx: Any, M: Tensor, solution: LCPSolution, options: Options) -> None:
+    z, w, basis, status, *_ = solution
+    saved = M, z, w, basis, status
     ctx.options = options
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(M, *solution[:4])
-    ctx.save_for_forward(M, *solution[:4])
+    ctx.save_for_backward(*saved)
+    ctx.save_for_forward(*saved)
 
 
 def batch_inputs(
@@ -122,10 +124,10 @@ def adjoint(
     `saved` holds M, z, w, basis and status.
     """
     M, z, w, basis, status = saved
+    if pivots(z, options) and not _differentiated(grad_z, grad_w):
+        return _adjoint_in_kernel(M, z, basis, status, grad_z, grad_w, need_M)
     grad_z = torch.zeros_like(z) if grad_z is None else grad_z
     grad_w = torch.zeros_like(w) if grad_w is None else grad_w
-    if pivots(z, options) and not _differentiated(z, grad_z, grad_w):
-        return _adjoint_in_kernel(M, z, basis, status, grad_z, grad_w, need_M)
     dtype = z.dtype
     M, z, w, grad_z, grad_w = (x.double() for x in (M, z, w, grad_z, grad_w))
     solved = (status == Status.SOLVED).unsqueeze(-1)
@@ -142,30 +144,37 @@ def adjoint(
     return grad_M, grad_q.to(dtype)
 
 
-def _differentiated(*tensors: Tensor) -> bool:
+def _differentiated(*grads: Tensor | None) -> bool:
     """Whether somebody wants a derivative of the backward, or maps it: then it has to be made of torch's operations."""
-    if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
+    if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return True
-    return any(unpack_dual(x).tangent is not None or torch._C._functorch.is_legacy_batchedtensor(x) for x in tensors)
+    return any(x is not None and torch._C._functorch.is_legacy_batchedtensor(x) for x in grads)
 
 
 def _adjoint_in_kernel(
-    M: Tensor, z: Tensor, basis: Tensor, status: Tensor, grad_z: Tensor, grad_w: Tensor, need_M: bool
+    M: Tensor,
+    z: Tensor,
+    basis: Tensor,
+    status: Tensor,
+    grad_z: Tensor | None,
+    grad_w: Tensor | None,
+    need_M: bool,
 ) -> tuple[Tensor | None, Tensor]:
     kernel: Any = pivoting_kernel()
-    n = z.shape[-1]
-    count = status.numel()
+    single = z.dtype is torch.float32
     grad_M, grad_q = kernel.solve_adjoint(
-        as_array(M, 1 if M.dim() == 2 else count, n, n),
-        as_array(z, count, n),
-        basis.numpy().reshape(count, n),
-        as_array(grad_z, count, n),
-        as_array(grad_w, count, n),
-        status.numpy().reshape(count) == 0,  # SOLVED; comparison with the enum itself takes longer than the solve
+        plain(M),
+        plain(z),
+        basis.contiguous(),
+        status,
+        None if grad_z is None else plain(grad_z),
+        None if grad_w is None else plain(grad_w),
         need_M,
-        single_precision=z.dtype is torch.float32,
+        single_precision=single,
     )
-    return as_tensor(grad_M, M) if need_M else None, as_tensor(grad_q, z)
+    if not single:
+        return grad_M, grad_q
+    return None if grad_M is None else grad_M.float(), grad_q.float()
 
 
 def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, options: Options) -> tuple[Tensor, Tensor]:

@@ -6,15 +6,12 @@ from functools import cache
 from types import ModuleType
 from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, interior_point
 from lcplearn.lcp.residuals import judge
 from lcplearn.lcp.solution import LCPSolution, Status
-
-FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 Method = Literal["auto", "diagonal", "pivoting", "interior_point"]
 
@@ -56,15 +53,11 @@ def pivoting_kernel() -> ModuleType | None:
     return pivoting
 
 
-def as_array(x: Tensor, *shape: int) -> np.ndarray:
-    """float64 array [*shape] on the tensor's memory; a copy only of what is not contiguous float64 already."""
-    return np.ascontiguousarray(x.resolve_neg().numpy(), np.float64).reshape(shape)
-
-
-def as_tensor(x: np.ndarray, like: Tensor) -> Tensor:
-    """Tensor on the array's memory, of the shape and type of another."""
-    result = torch.from_numpy(x.reshape(like.shape))
-    return result if like.dtype is torch.float64 else result.to(like.dtype)
+def plain(x: Tensor) -> Tensor:
+    """The same tensor if the kernel can read its memory as it is, contiguous and float64; else a copy."""
+    if x.dtype is torch.float64 and x.is_contiguous() and not x.is_neg():
+        return x
+    return x.detach().resolve_neg().double().contiguous()
 
 
 def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:
@@ -75,29 +68,27 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
     if not q.is_cpu:
         raise ValueError(f"method 'pivoting' runs on the CPU; got M and q on {q.device}")
     single = q.dtype is torch.float32
-    shape = tuple(q.shape)
-    batch, n = shape[:-1], shape[-1]
-    count = math.prod(batch)
-    result = kernel.solve_batch(
-        as_array(M, 1 if M.dim() == 2 else count, n, n),
-        as_array(q, count, n),
+    solution: LCPSolution = kernel.solve_batch(
+        plain(M),
+        plain(q),
         single_precision=single,
         max_iter=options.max_iter,
         tol=options.tol,
-        initial_basis=None if initial_basis is None else initial_basis.numpy().reshape(count, n),
+        initial_basis=initial_basis,
     )
-    z, w, basis, residual, status, iterations, certificate = result
-    if single:
-        overflow = (status == 0) & (np.maximum(z, w) > FLOAT32_MAX).any(-1)
-        status[overflow], residual[overflow] = Status.UNSOLVED, np.inf
-        z, w = (x.clip(-FLOAT32_MAX, FLOAT32_MAX).astype(np.float32) for x in (z, w))
-        certificate = certificate.astype(np.float32)
-    if len(batch) != 1:
-        z, w, basis, certificate = z.reshape(shape), w.reshape(shape), basis.reshape(shape), certificate.reshape(shape)
-        status, residual, iterations = status.reshape(batch), residual.reshape(batch), iterations.reshape(batch)
-    tensor = torch.from_numpy
-    return LCPSolution(
-        tensor(z), tensor(w), tensor(basis), tensor(status), tensor(residual), tensor(iterations), tensor(certificate)
+    return _rounded(solution) if single else solution
+
+
+def _rounded(solution: LCPSolution) -> LCPSolution:
+    """The solution in float32; what overflows there is not SOLVED."""
+    limit = torch.finfo(torch.float32).max
+    overflow = (solution.status == 0) & (torch.maximum(solution.z, solution.w) > limit).any(-1)
+    return solution._replace(
+        z=solution.z.clamp(-limit, limit).float(),
+        w=solution.w.clamp(-limit, limit).float(),
+        status=torch.where(overflow, Status.UNSOLVED.value, solution.status),
+        residual=torch.where(overflow, torch.inf, solution.residual),
+        certificate=solution.certificate.float(),
     )
 
 

@@ -26,13 +26,17 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from math import frexp, ldexp, sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
+import torch
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
+from torch import Tensor
+
+from lcplearn.lcp.solution import LCPSolution
 
 RUIZ_SWEEPS = 4  # as in residuals.py
 EPS = 2.220446049250313e-16
@@ -62,74 +66,61 @@ def _jit_inline(function: Callable[..., Any]) -> Any:
     return _jit(function, forceinline=True)
 
 
-class PivotingResult(NamedTuple):
-    """Arrays of `solve_batch`; the fields mean what they mean in `LCPSolution`."""
-
-    z: np.ndarray  # float64 [B, n], zero off the basis
-    w: np.ndarray  # float64 [B, n], zero on the basis
-    basis: np.ndarray  # bool [B, n]
-    residual: np.ndarray  # float64 [B]
-    status: np.ndarray  # int64 [B]
-    iterations: np.ndarray  # int64 [B]
-    certificate: np.ndarray  # float64 [B, n], zero unless INFEASIBLE
-
-
 def solve_batch(
-    M: np.ndarray,
-    q: np.ndarray,
+    M: Tensor,
+    q: Tensor,
     *,
     single_precision: bool,
     max_iter: int | None,
     tol: float | None = None,
-    initial_basis: np.ndarray | None = None,
-) -> PivotingResult:
-    """Solve B LCPs; each element's result is independent of its neighbours, bit by bit.
+    initial_basis: Tensor | None = None,
+) -> LCPSolution:
+    """Solve a batch of LCPs; each element's result is independent of its neighbours, bit by bit.
 
     Args:
-        M: float64 [B, n, n], or [1, n, n] shared by the batch; not copied if C-contiguous, never written to.
-        q: float64 [B, n], or [1, n] shared by the batch; likewise.
+        M: [*batch, n, n], or [n, n] shared by the batch; contiguous float64 on the CPU, never written to.
+        q: [*batch, n]; likewise.
         single_precision: the data were rounded to float32, so pivots below 1e-6 are noise and the tolerance is 2e-6.
         max_iter: pivots and interior-point steps allowed to an element; None lets each stage choose.
         tol: largest residual that is SOLVED; None is 1e-10, or 2e-6 for single precision.
-        initial_basis: bool [B, n], where block pivoting starts.
+        initial_basis: bool [*batch, n], where block pivoting starts.
 
     Status:
         SOLVED, INFEASIBLE (with certificate), UNSOLVED, MAX_ITERATIONS, NONFINITE_INPUT (z and w are NaN).
 
     Cost: O(n^3) per principal block, O(n^2) per Lemke pivot; memory O(B n + n^2).
     """
-    n = q.shape[-1]
-    B = min(M.shape[0], q.shape[0]) and max(M.shape[0], q.shape[0])
-    z, w = np.empty((B, n)), np.empty((B, n))
-    basis = np.empty((B, n), dtype=np.bool_)
+    shape = q.shape
+    batch, n = shape[:-1], shape[-1]
+    tensor, empty = torch.from_numpy, np.empty  # faster than torch.empty
+    z, w, basis = tensor(empty(shape)), tensor(empty(shape)), tensor(empty(shape, np.bool_))
+    status, iterations = tensor(empty(batch, np.int64)), tensor(empty(batch, np.int64))
+    residual, certificate = tensor(empty(batch)), tensor(empty(shape))
     if initial_basis is not None:
-        basis[...] = initial_basis
-    residual = np.zeros(B)
-    status, iterations = np.zeros(B, dtype=np.int64), np.zeros(B, dtype=np.int64)
-    certificate = np.zeros((B, n))
-    result = PivotingResult(z, w, basis, residual, status, iterations, certificate)
-    if B == 0 or n == 0:
-        return result
+        basis.copy_(initial_basis)
     if tol is None:
         tol = 2e-6 if single_precision else 1e-10
-    _announce_compilation()
-    M, q = _plain(M), _plain(q)
     budget = -1 if max_iter is None else max_iter
-    floats, integers = np.empty(3 * n * n + 19 * n + 16), np.empty(8 * n + 2, dtype=np.int64)  # scratch
-    _solve_range(M, q, tol, single_precision, budget, initial_basis is not None, floats, integers, *result)
-    return result
+    floats, integers = empty(3 * n * n + 19 * n + 16), empty(8 * n + 2, np.int64)  # scratch
+    _announce_compilation()
+    _solve_range(
+        status.numel(), n, M.dim() == 2, address(M), address(q), tol, single_precision, budget,
+        initial_basis is not None, floats, integers, z.data_ptr(), w.data_ptr(), basis.data_ptr(), residual.data_ptr(),
+        status.data_ptr(), iterations.data_ptr(), certificate.data_ptr(),
+    )  # fmt: skip
+    return LCPSolution(z, w, basis, status, residual, iterations, certificate)
 
 
 def solve_adjoint(
-    M: np.ndarray,
-    z: np.ndarray,
-    basis: np.ndarray,
-    grad_z: np.ndarray,
-    grad_w: np.ndarray,
-    solved: np.ndarray,
+    M: Tensor,
+    z: Tensor,
+    basis: Tensor,
+    status: Tensor,
+    grad_z: Tensor | None,
+    grad_w: Tensor | None,
     need_M: bool,
     single_precision: bool = False,
-) -> tuple[np.ndarray | None, np.ndarray]:
+) -> tuple[Tensor | None, Tensor]:
     """Gradients of a scalar with respect to M and q from those with respect to z and w, at the basis A.
 
     z_A = -M_AA^-1 q_A and w_I = M_IA z_A + q_I, so with M_AA' y_A = -(grad_z_A + M_IA' grad_w_I) and y_I = grad_w_I
@@ -137,33 +128,36 @@ def solve_adjoint(
         grad_q = y,   grad_M = y z'
 
     Args:
-        M: float64 [B, n, n] or [1, n, n]; grad_M has its shape, and for a shared M it is the sum over the batch.
-        z, grad_z, grad_w: float64 [B, n]; basis: bool [B, n].
-        solved: bool [B]; the other elements get zero gradients.
+        M: [*batch, n, n] or [n, n]; grad_M has its shape, and for a shared M it is the sum over the batch.
+        z, grad_z, grad_w: [*batch, n], a gradient of None is zero; all contiguous float64 on the CPU.
+        basis: bool [*batch, n]; status: int64 [*batch]. What is not SOLVED gets zero gradients.
         need_M: whether grad_M is wanted; else None is returned for it.
         single_precision: the data were rounded to float32, so that pivots below 1e-7 n are noise.
 
     Returns:
-        grad_M (or None) and grad_q [B, n]. Where M_AA is singular (redundant contacts, and the solver ended on an
+        grad_M (or None) and grad_q [*batch, n]. Where M_AA is singular (redundant contacts, and the solver ended on an
         interior point), y solves the consistent part of the equations: the gradient of unique quantities is exact.
     """
-    grad_q = np.zeros(z.shape)
-    grad_M = np.zeros(M.shape if need_M else (0, 0, 0))
-    if grad_q.size:
-        M, z, grad_z, grad_w = _plain(M), _plain(z), _plain(grad_z), _plain(grad_w)
-        n = z.shape[-1]
-        floats, integers = np.empty(n * n + 4 * n), np.empty(3 * n, dtype=np.int64)  # scratch
-        _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, single_precision, grad_M, grad_q)
-    return (grad_M if need_M else None), grad_q
+    n = z.shape[-1]
+    grad_q = torch.from_numpy(np.empty(z.shape))
+    grad_M = torch.from_numpy(np.empty(M.shape)) if need_M else None
+    floats, integers = np.empty(n * n + 4 * n), np.empty(3 * n, np.int64)  # scratch
+    _adjoint_range(
+        status.numel(), n, M.dim() == 2, address(M), address(z), address(basis), address(status), address(grad_z),
+        address(grad_w), floats, integers, single_precision, 0 if grad_M is None else grad_M.data_ptr(),
+        grad_q.data_ptr(),
+    )  # fmt: skip
+    return grad_M, grad_q
 
 
-def _plain(array: np.ndarray) -> np.ndarray:
-    """The same array where it is already C-contiguous float64 and writable, as torch's are; else a copy.
-
-    The kernel reads bare memory, and numba would compile a second kernel for read-only arrays.
-    """
-    array = np.ascontiguousarray(array, dtype=np.float64)
-    return array if array.flags.writeable else array.copy()
+def address(x: Tensor | None) -> int:
+    """Where a tensor's numbers are, for the kernel; 0 for None. One that has none, as under a tracer, raises."""
+    if x is None:
+        return 0
+    result = x.data_ptr()
+    if result == 0 and x.numel():
+        raise RuntimeError("a tensor without memory (traced or fake) reached the LCP kernel")
+    return result
 
 
 @cache
@@ -892,57 +886,44 @@ def _solve_one(
 
 @_jit
 def _solve_range(
-    M,
-    q,
-    tol,
-    single_precision,
-    budget,
-    warm,
-    floats,
-    integers,
-    z_out,
-    w_out,
-    basis_out,
-    residual_out,
-    status_out,
-    iterations_out,
-    u_out,
-):
-    """Run the cascade for each element; the last arguments are the fields of PivotingResult."""
-    B, n = z_out.shape
+    B, n, shared, M_at, q_at, tol, single_precision, budget, warm, floats, integers,
+    z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at
+):  # fmt: skip
+    """Run the cascade for each element; the last arguments are addresses of the fields of LCPSolution."""
     width = (n + 3) // 4 * 4  # whole vectors of 4 doubles
-    Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
-    qs = numba.carray(_pointer(q.ctypes.data, 0.0), q.shape)
+    Ms, qs = numba.carray(_pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(_pointer(q_at, 0.0), (B, n))
     S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n + 2, width)
     f = 2 * n * n + (n + 2) * width
     d, p, cover = _vector(floats, f, n), _vector(floats, f + n, n), _vector(floats, f + 2 * n, n)
     z, w, omega = _vector(floats, f + 3 * n, n), _vector(floats, f + 4 * n, n), _vector(floats, f + 5 * n, n)
     y, v, x = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 11 * n + width, n + 2)
     r, c, buffer = _vector(floats, f + 9 * n, n), _vector(floats, f + 10 * n, n), _vector(floats, f + 11 * n, width)
-    zs = numba.carray(_pointer(z_out.ctypes.data, 0.0), z_out.shape)
-    ws = numba.carray(_pointer(w_out.ctypes.data, 0.0), w_out.shape)
-    us = numba.carray(_pointer(u_out.ctypes.data, 0.0), u_out.shape)
+    zs, ws = numba.carray(_pointer(z_at, 0.0), (B, n)), numba.carray(_pointer(w_at, 0.0), (B, n))
+    us, bases = numba.carray(_pointer(u_at, 0.0), (B, n)), numba.carray(_pointer(basis_at, False), (B, n))
+    residuals, statuses = numba.carray(_pointer(residual_at, 0.0), (B,)), numba.carray(_pointer(status_at, 0), (B,))
+    iterations = numba.carray(_pointer(iterations_at, 0), (B,))
     rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
     basic, basis, column = _vector(integers, 3 * n, n), _vector(integers, 4 * n, n), _vector(integers, 5 * n, n + 1)
     place = _vector(integers, 6 * n + 1, 2 * n + 1)
     for b in range(B):
-        Mb, qb = Ms[b if M.shape[0] > 1 else 0], qs[b if q.shape[0] > 1 else 0]
+        Mb, qb = Ms[0 if shared else b], qs[b]
+        for i in range(n):  # until a stage has a candidate
+            basis[i] = bases[b, i] if warm else qb[i] < 0.0
+            zs[b, i], ws[b, i], bases[b, i], us[b, i] = 0.0, 0.0, False, 0.0
+        residuals[b], statuses[b], iterations[b] = 0.0, SOLVED, 0
         if not (_all_finite(qb) and _all_finite(Mb)):
-            z_out[b], w_out[b], basis_out[b] = np.nan, np.nan, False
-            residual_out[b], status_out[b] = np.inf, NONFINITE_INPUT
+            zs[b], ws[b] = np.nan, np.nan
+            residuals[b], statuses[b] = np.inf, NONFINITE_INPUT
             continue
         if _nonnegative(qb):
-            for i in range(n):
-                zs[b, i], ws[b, i], basis_out[b, i] = 0.0, qb[i], False
+            ws[b] = qb
             continue
         _equilibrate(Mb, A, x, d)
         for i in range(n):
             r[i] = c[i] = d[i]
-            basis[i] = basis_out[b, i] if warm else qb[i] < 0.0
-            zs[b, i], ws[b, i], basis_out[b, i] = 0.0, 0.0, False  # in case no stage has a candidate
-        status_out[b], residual_out[b], iterations_out[b] = _solve_one(
+        statuses[b], residuals[b], iterations[b] = _solve_one(
             Mb, qb, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
-            rows, cols, index, basic, basis, column, place, zs[b], ws[b], basis_out[b], us[b]
+            rows, cols, index, basic, basis, column, place, zs[b], ws[b], bases[b], us[b]
         )  # fmt: skip
 
 
@@ -965,48 +946,65 @@ def _equilibrate_rows_and_columns(A, k, r, s):
 
 
 @_jit
-def _adjoint_range(M, z, basis, grad_z, grad_w, solved, floats, integers, single_precision, grad_M, grad_q):
-    """The adjoint of each element; see `solve_adjoint`."""
-    B, n = z.shape
+def _adjoint_range(
+    B, n, shared, M_at, z_at, basis_at, status_at, grad_z_at, grad_w_at, floats, integers, single_precision,
+    grad_M_at, grad_q_at
+):  # fmt: skip
+    """The adjoint of each element; see `solve_adjoint`. The address of what is not there is 0."""
     singular, dependent = (n * 1e-7, 1e-5) if single_precision else (n * EPS, 1e-11)
     A = _matrix(floats, 0, n, n)
     x, scratch = _vector(floats, n * n, n), _vector(floats, n * n + n, n)
     r, s = _vector(floats, n * n + 2 * n, n), _vector(floats, n * n + 3 * n, n)
     rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
-    Ms = numba.carray(_pointer(M.ctypes.data, 0.0), M.shape)
+    Ms, zs = numba.carray(_pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(_pointer(z_at, 0.0), (B, n))
+    bases, statuses = numba.carray(_pointer(basis_at, False), (B, n)), numba.carray(_pointer(status_at, 0), (B,))
+    grads_z, grads_w = numba.carray(_pointer(grad_z_at, 0.0), (B, n)), numba.carray(_pointer(grad_w_at, 0.0), (B, n))
+    grads_M, ys = numba.carray(_pointer(grad_M_at, 0.0), Ms.shape), numba.carray(_pointer(grad_q_at, 0.0), (B, n))
+    if grad_M_at != 0 and shared:
+        grads_M[0] = 0.0
     for b in range(B):
-        if not solved[b]:
-            continue
-        Mb = Ms[b if M.shape[0] > 1 else 0]
-        rank = -1
-        for complete in range(2):
-            k = 0
-            for i in range(n):
-                if basis[b, i]:
-                    index[k] = i
-                    k += 1
+        Mb, y = Ms[0 if shared else b], ys[b]
+        y[:] = 0.0
+        if statuses[b] == SOLVED:
+            k, rank = _factor_transpose(Mb, bases[b], A, r, s, rows, cols, index, singular, dependent)
             for a in range(k):
-                for c in range(k):
-                    A[c, a] = Mb[index[a], index[c]]
-            _equilibrate_rows_and_columns(A, k, r, s)  # whether a pivot is zero must not depend on units
-            rank = _factor(A, k, rows, cols, dependent if complete else singular, complete == 1)
-            if rank == k:
-                break
-        for a in range(k):
-            x[a] = -grad_z[b, index[a]]
-        for i in range(n):
-            if not basis[b, i] and grad_w[b, i] != 0.0:
-                grad_q[b, i] = grad_w[b, i]
-                for a in range(k):
-                    x[a] -= Mb[i, index[a]] * grad_w[b, i]
-        for a in range(k):
-            x[a] *= r[a]
-        _solve(A, k, rank, rows, cols, x, scratch)
-        for a in range(k):
-            grad_q[b, index[a]] = s[a] * x[a]
-        if grad_M.shape[0] > 0:
-            m = b if grad_M.shape[0] > 1 else 0
+                x[a] = -grads_z[b, index[a]] if grad_z_at != 0 else 0.0
+            if grad_w_at != 0:
+                for i in range(n):
+                    if not bases[b, i] and grads_w[b, i] != 0.0:
+                        y[i] = grads_w[b, i]
+                        for a in range(k):
+                            x[a] -= Mb[i, index[a]] * y[i]
+            for a in range(k):
+                x[a] *= r[a]
+            _solve(A, k, rank, rows, cols, x, scratch)
+            for a in range(k):
+                y[index[a]] = s[a] * x[a]
+        if grad_M_at != 0:
             for i in range(n):
-                if grad_q[b, i] != 0.0:
+                if not shared:
                     for j in range(n):
-                        grad_M[m, i, j] += grad_q[b, i] * z[b, j]
+                        grads_M[b, i, j] = y[i] * zs[b, j] if y[i] != 0.0 else 0.0
+                elif y[i] != 0.0:
+                    for j in range(n):
+                        grads_M[0, i, j] += y[i] * zs[b, j]
+
+
+@_jit_inline
+def _factor_transpose(M, basis, A, r, s, rows, cols, index, singular, dependent):
+    """LU of M_AA' with rows r and columns s scaled, by complete pivoting if it is singular; its size and rank."""
+    k = 0
+    for i in range(basis.size):
+        if basis[i]:
+            index[k] = i
+            k += 1
+    rank = -1
+    for complete in range(2):
+        for a in range(k):
+            for c in range(k):
+                A[c, a] = M[index[a], index[c]]
+        _equilibrate_rows_and_columns(A, k, r, s)  # whether a pivot is zero must not depend on units
+        rank = _factor(A, k, rows, cols, dependent if complete else singular, complete == 1)
+        if rank == k:
+            break
+    return k, rank

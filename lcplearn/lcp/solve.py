@@ -13,6 +13,8 @@ from lcplearn.lcp.methods import Method, Options
 from lcplearn.lcp.residuals import default_tolerance
 from lcplearn.lcp.solution import LCPSolution
 
+DTYPES = frozenset((torch.float32, torch.float64))
+
 
 def solve_lcp(
     M: Float[Tensor, "*#batch n n"],
@@ -67,18 +69,16 @@ def solve_lcp(
     """
     if not (method == "auto" and tol is None and max_iter is None and smoothing == 0):
         check_options(method, tol, max_iter, smoothing)
-    batch = _check_tensors(M, q, initial_basis)
-    n = q.shape[-1]
-    if len(M.shape) > 2 and M.shape[:-2] != batch:
-        M = M.reshape(n, n) if M.shape[:-2].numel() == 1 else M.expand(*batch, n, n)
-    if q.shape[:-1] != batch:
-        q = q.expand(*batch, n)
+    _check_tensors(M, q)
+    if M.shape[:-1] != q.shape:
+        M, q = _broadcast(M, q)
     if initial_basis is not None:
         if method not in ("auto", "pivoting"):
             raise ValueError(f"initial_basis needs method 'pivoting' or 'auto'; got method {method!r}")
-        initial_basis = initial_basis.expand(*batch, n)
+        initial_basis = _expand_basis(initial_basis, q)
     options = Options(method, tol or default_tolerance(q.dtype), max_iter, smoothing)
-    run = traced_solve if torch.compiler.is_compiling() else differentiable_solve
+    traced = torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack()  # compile, export, make_fx, fakes
+    run = traced_solve if traced else differentiable_solve
     solution = run(M, q, initial_basis, options)
     if throw:
         solution.raise_if_unsolved()
@@ -104,45 +104,50 @@ def _is_number(x: object) -> bool:
     return isinstance(x, (int, float)) and not isinstance(x, bool)
 
 
-def _check_tensors(M: Tensor, q: Tensor, initial_basis: Tensor | None) -> torch.Size:
-    """Raise ValueError for tensors that are no batch of LCPs; return the common batch shape."""
+def _check_tensors(M: Tensor, q: Tensor) -> None:
+    """Raise ValueError for tensors that are no LCPs, whatever their batch dimensions."""
     for name, x in (("M", M), ("q", q)):
         if not isinstance(x, Tensor):
             raise ValueError(f"{name} must be a torch.Tensor; got {type(x).__name__}")
         if x.layout is not torch.strided:
             raise ValueError(f"{name} must be dense; got {x.layout}")
-        if x.dtype not in (torch.float32, torch.float64):
+        if x.dtype not in DTYPES:
             raise ValueError(f"{name} must be float32 or float64; got {x.dtype}")
-    if M.dtype != q.dtype or M.device != q.device:
+    if M.dtype is not q.dtype or M.device != q.device:
         raise ValueError(f"M and q must share dtype and device; got {M.dtype} on {M.device}, {q.dtype} on {q.device}")
-    if M.dim() < 2 or M.shape[-1] != M.shape[-2]:
-        raise ValueError(f"M must have shape [*batch, n, n]; got {list(M.shape)}")
-    if q.dim() < 1 or q.shape[-1] != M.shape[-1]:
-        raise ValueError(f"q must have shape [*batch, {M.shape[-1]}] to match M {list(M.shape)}; got {list(q.shape)}")
-    batch = _broadcast(M.shape, q.shape)
-    if initial_basis is not None:
-        _check_basis(initial_basis, q, [*batch, q.shape[-1]])
-    return batch
+    M_shape, q_shape = M.shape, q.shape
+    if len(M_shape) < 2 or M_shape[-1] != M_shape[-2]:
+        raise ValueError(f"M must have shape [*batch, n, n]; got {list(M_shape)}")
+    if len(q_shape) < 1 or q_shape[-1] != M_shape[-1]:
+        raise ValueError(f"q must have shape [*batch, {M_shape[-1]}] to match M {list(M_shape)}; got {list(q_shape)}")
 
 
-def _check_basis(basis: Tensor, q: Tensor, shape: list[int]) -> None:
-    """Raise ValueError for an initial basis that is not a bool for each unknown."""
-    if not isinstance(basis, Tensor):
-        found = type(basis).__name__
-    elif basis.dtype != torch.bool or basis.device != q.device or list(basis.shape) not in (list(q.shape), shape):
-        found = f"{basis.dtype} {list(basis.shape)} on {basis.device}"
-    else:
-        return
-    raise ValueError(f"initial_basis must be a bool tensor of shape {shape} on {q.device}; got {found}")
-
-
-def _broadcast(M_shape: torch.Size, q_shape: torch.Size) -> torch.Size:
-    """The common batch shape; torch's own function takes longer than a small solve."""
-    if len(M_shape) == 2 or M_shape[:-2] == q_shape[:-1]:
-        return q_shape[:-1]
+def _broadcast(M: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """M [*batch, n, n], or [n, n] where it is shared by the whole batch, and q [*batch, n]."""
+    n = q.shape[-1]
     try:
-        return torch.broadcast_shapes(M_shape[:-2], q_shape[:-1])
+        batch = torch.broadcast_shapes(M.shape[:-2], q.shape[:-1])
     except RuntimeError:
         raise ValueError(
-            f"batch dimensions of M {list(M_shape)} and q {list(q_shape)} must broadcast; they do not"
+            f"batch dimensions of M {list(M.shape)} and q {list(q.shape)} must broadcast; they do not"
         ) from None
+    shared = M.shape[:-2].numel() == 1
+    return M.reshape(n, n) if shared else M.expand(*batch, n, n), q.expand(*batch, n)
+
+
+def _expand_basis(basis: Tensor, q: Tensor) -> Tensor:
+    """The initial basis of each element; ValueError if it is not a bool for each unknown."""
+    if not isinstance(basis, Tensor):
+        found = type(basis).__name__
+    elif basis.dtype != torch.bool or basis.device != q.device or not _expands(basis.shape, q.shape):
+        found = f"{basis.dtype} {list(basis.shape)} on {basis.device}"
+    else:
+        return basis.expand(q.shape)
+    raise ValueError(f"initial_basis must be a bool tensor of shape {list(q.shape)} on {q.device}; got {found}")
+
+
+def _expands(shape: torch.Size, target: torch.Size) -> bool:
+    try:
+        return torch.broadcast_shapes(shape, target) == target and shape[-1:] == target[-1:]
+    except RuntimeError:
+        return False

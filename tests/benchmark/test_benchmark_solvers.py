@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lcplearn import solve_lcp
 from lcplearn.benchmark import problems, solvers, speed_checks
 from lcplearn.benchmark.accuracy_checks import check_family, check_gradient, check_hard
 from lcplearn.benchmark.gradient_error import gradient_errors, line, reference
@@ -11,8 +12,6 @@ from lcplearn.benchmark.measuring import exponent, interleave, peak_memory
 from lcplearn.benchmark.methods import peers
 from lcplearn.benchmark.solvers import families, measure, plan, size
 from lcplearn.benchmark.study import Options, Study, read_rows
-from lcplearn.lcp import pivoting
-from lcplearn.lcp.solution import Status
 
 FAMILIES = ("F1 sliding block direct n=2", "F3 polygon n=8", "F5 positive definite n=10")
 
@@ -52,7 +51,7 @@ def test_true_slopes_are_those_of_finite_differences(family):
 
     def loss(t):
         at = data.M * (1 + t * path.F) * (1 + t * path.H), data.q + t * path.dq
-        z = pivoting.solve_batch(*at, single_precision=False, max_iter=None).z
+        z = solve_lcp(*map(torch.from_numpy, at)).z.numpy()
         return np.einsum("bm,bmn,bn->b", path.c, path.A, z)
 
     difference = (loss(h) - loss(-h)) / (2 * h)
@@ -82,8 +81,7 @@ def test_a_line_of_friction_problems_stays_solvable():
     data = problems.stacked_cubes(np.random.default_rng(0), 20)
     path = line("F4 cube n=24", data, seed=1)
     moved = data.M * (1 + 0.01 * path.F), data.q + 0.01 * path.dq
-    result = pivoting.solve_batch(*moved, single_precision=False, max_iter=None)
-    assert (result.status == Status.SOLVED).all()
+    assert solve_lcp(*map(torch.from_numpy, moved)).solved.all()
 
 
 def test_each_applicable_method_has_a_row_and_residuals_are_of_its_precision():

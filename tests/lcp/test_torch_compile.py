@@ -3,6 +3,8 @@
 import pytest
 import torch
 from lcp.oracles import planted, random_family
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from lcplearn import LCPLayer, solve_lcp
 
@@ -105,3 +107,13 @@ def test_operators_pass_the_operator_check_of_torch(shared):
         for need_M in (True, False):
             arguments = (*saved, torch.ones_like(q).detach(), None, need_M, *options)
             torch.library.opcheck(torch.ops.lcplearn.adjoint.default, arguments)
+
+
+def test_symbolic_tracers_see_one_operator_and_no_constant():
+    """A solve that a tracer recorded as a constant would answer every later problem with the first one's solution."""
+    M, q = 2 * torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
+    traced = make_fx(lambda M, q: solve_lcp(M, q).z)(M, q)
+    torch.testing.assert_close(traced(M, 3 * q), solve_lcp(M, 3 * q).z)
+    with FakeTensorMode() as mode:
+        fake = solve_lcp(mode.from_tensor(M), mode.from_tensor(q))
+    assert [x.shape for x in fake] == [x.shape for x in solve_lcp(M, q)]

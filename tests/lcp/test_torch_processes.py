@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 from lcplearn import LCPLayer, solve_lcp
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of one core
 @pytest.mark.parametrize("start", ["fork", "spawn"])
 def test_data_loader_workers_solve_also_after_their_parent_has(start):
     expected = torch.stack([SolvedProblems()[k] for k in range(4)])  # the parent solves first
