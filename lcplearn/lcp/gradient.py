@@ -144,11 +144,12 @@ def adjoint(
     return grad_M, grad_q.to(dtype)
 
 
-def _differentiated(*grads: Tensor | None) -> bool:
+def _differentiated(grad_z: Tensor | None, grad_w: Tensor | None) -> bool:
     """Whether somebody wants a derivative of the backward, or maps it: then it has to be made of torch's operations."""
     if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return True
-    return any(x is not None and torch._C._functorch.is_legacy_batchedtensor(x) for x in grads)
+    mapped = torch._C._functorch.is_legacy_batchedtensor
+    return (grad_z is not None and mapped(grad_z)) or (grad_w is not None and mapped(grad_w))
 
 
 def _adjoint_in_kernel(

@@ -55,9 +55,9 @@ def pivoting_kernel() -> ModuleType | None:
 
 def plain(x: Tensor) -> Tensor:
     """The same tensor if the kernel can read its memory as it is, contiguous and float64; else a copy."""
-    if x.dtype is torch.float64 and x.is_contiguous() and not x.is_neg():
-        return x
-    return x.detach().resolve_neg().double().contiguous()
+    if x.is_neg() or x.dtype is not torch.float64:
+        x = x.resolve_neg().double()
+    return x.contiguous()
 
 
 def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:

@@ -101,12 +101,11 @@ def solve_batch(
     if tol is None:
         tol = 2e-6 if single_precision else 1e-10
     budget = -1 if max_iter is None else max_iter
-    floats, integers = empty(3 * n * n + 19 * n + 16), empty(8 * n + 2, np.int64)  # scratch
     _announce_compilation()
     _solve_range(
         status.numel(), n, M.dim() == 2, address(M), address(q), tol, single_precision, budget,
-        initial_basis is not None, floats, integers, z.data_ptr(), w.data_ptr(), basis.data_ptr(), residual.data_ptr(),
-        status.data_ptr(), iterations.data_ptr(), certificate.data_ptr(),
+        initial_basis is not None, empty(3 * n * n + 27 * n + 18), z.data_ptr(), w.data_ptr(), basis.data_ptr(),
+        residual.data_ptr(), status.data_ptr(), iterations.data_ptr(), certificate.data_ptr(),
     )  # fmt: skip
     return LCPSolution(z, w, basis, status, residual, iterations, certificate)
 
@@ -141,10 +140,9 @@ def solve_adjoint(
     n = z.shape[-1]
     grad_q = torch.from_numpy(np.empty(z.shape))
     grad_M = torch.from_numpy(np.empty(M.shape)) if need_M else None
-    floats, integers = np.empty(n * n + 4 * n), np.empty(3 * n, np.int64)  # scratch
     _adjoint_range(
         status.numel(), n, M.dim() == 2, address(M), address(z), address(basis), address(status), address(grad_z),
-        address(grad_w), floats, integers, single_precision, 0 if grad_M is None else grad_M.data_ptr(),
+        address(grad_w), np.empty(n * n + 7 * n), single_precision, 0 if grad_M is None else grad_M.data_ptr(),
         grad_q.data_ptr(),
     )  # fmt: skip
     return grad_M, grad_q
@@ -221,8 +219,14 @@ def _matrix(memory, start, rows, columns):
 
 @_jit
 def _vector(memory, start, size):
-    """View of part of a vector of 8-byte numbers."""
+    """View of part of a vector of doubles."""
     return numba.carray(_pointer(memory.ctypes.data + 8 * start, memory[0]), (size,))
+
+
+@_jit
+def _integers(memory, start, size):
+    """The same part as integers."""
+    return numba.carray(_pointer(memory.ctypes.data + 8 * start, 0), (size,))
 
 
 # --- linear algebra -------------------------------------------------------------------------------------------------
@@ -886,25 +890,27 @@ def _solve_one(
 
 @_jit
 def _solve_range(
-    B, n, shared, M_at, q_at, tol, single_precision, budget, warm, floats, integers,
+    B, n, shared, M_at, q_at, tol, single_precision, budget, warm, scratch,
     z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at
 ):  # fmt: skip
     """Run the cascade for each element; the last arguments are addresses of the fields of LCPSolution."""
     width = (n + 3) // 4 * 4  # whole vectors of 4 doubles
     Ms, qs = numba.carray(_pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(_pointer(q_at, 0.0), (B, n))
-    S, A, T = _matrix(floats, 0, n, n), _matrix(floats, n * n, n, n), _matrix(floats, 2 * n * n, n + 2, width)
+    S, A, T = _matrix(scratch, 0, n, n), _matrix(scratch, n * n, n, n), _matrix(scratch, 2 * n * n, n + 2, width)
     f = 2 * n * n + (n + 2) * width
-    d, p, cover = _vector(floats, f, n), _vector(floats, f + n, n), _vector(floats, f + 2 * n, n)
-    z, w, omega = _vector(floats, f + 3 * n, n), _vector(floats, f + 4 * n, n), _vector(floats, f + 5 * n, n)
-    y, v, x = _vector(floats, f + 6 * n, n), _vector(floats, f + 7 * n, n), _vector(floats, f + 11 * n + width, n + 2)
-    r, c, buffer = _vector(floats, f + 9 * n, n), _vector(floats, f + 10 * n, n), _vector(floats, f + 11 * n, width)
+    d, p, cover = _vector(scratch, f, n), _vector(scratch, f + n, n), _vector(scratch, f + 2 * n, n)
+    z, w, omega = _vector(scratch, f + 3 * n, n), _vector(scratch, f + 4 * n, n), _vector(scratch, f + 5 * n, n)
+    y, v, r = _vector(scratch, f + 6 * n, n), _vector(scratch, f + 7 * n, n), _vector(scratch, f + 8 * n, n)
+    c, x = _vector(scratch, f + 9 * n, n), _vector(scratch, f + 10 * n, n + 2)
+    buffer = _vector(scratch, f + 11 * n + 2, width)
     zs, ws = numba.carray(_pointer(z_at, 0.0), (B, n)), numba.carray(_pointer(w_at, 0.0), (B, n))
     us, bases = numba.carray(_pointer(u_at, 0.0), (B, n)), numba.carray(_pointer(basis_at, False), (B, n))
     residuals, statuses = numba.carray(_pointer(residual_at, 0.0), (B,)), numba.carray(_pointer(status_at, 0), (B,))
     iterations = numba.carray(_pointer(iterations_at, 0), (B,))
-    rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
-    basic, basis, column = _vector(integers, 3 * n, n), _vector(integers, 4 * n, n), _vector(integers, 5 * n, n + 1)
-    place = _vector(integers, 6 * n + 1, 2 * n + 1)
+    i = f + 11 * n + 2 + width
+    rows, cols, index = _integers(scratch, i, n), _integers(scratch, i + n, n), _integers(scratch, i + 2 * n, n)
+    basic, basis = _integers(scratch, i + 3 * n, n), _integers(scratch, i + 4 * n, n)
+    column, place = _integers(scratch, i + 5 * n, n + 1), _integers(scratch, i + 6 * n + 1, 2 * n + 1)
     for b in range(B):
         Mb, qb = Ms[0 if shared else b], qs[b]
         for i in range(n):  # until a stage has a candidate
@@ -947,15 +953,16 @@ def _equilibrate_rows_and_columns(A, k, r, s):
 
 @_jit
 def _adjoint_range(
-    B, n, shared, M_at, z_at, basis_at, status_at, grad_z_at, grad_w_at, floats, integers, single_precision,
+    B, n, shared, M_at, z_at, basis_at, status_at, grad_z_at, grad_w_at, memory, single_precision,
     grad_M_at, grad_q_at
 ):  # fmt: skip
     """The adjoint of each element; see `solve_adjoint`. The address of what is not there is 0."""
     singular, dependent = (n * 1e-7, 1e-5) if single_precision else (n * EPS, 1e-11)
-    A = _matrix(floats, 0, n, n)
-    x, scratch = _vector(floats, n * n, n), _vector(floats, n * n + n, n)
-    r, s = _vector(floats, n * n + 2 * n, n), _vector(floats, n * n + 3 * n, n)
-    rows, cols, index = _vector(integers, 0, n), _vector(integers, n, n), _vector(integers, 2 * n, n)
+    A = _matrix(memory, 0, n, n)
+    x, scratch = _vector(memory, n * n, n), _vector(memory, n * n + n, n)
+    r, s = _vector(memory, n * n + 2 * n, n), _vector(memory, n * n + 3 * n, n)
+    i = n * n + 4 * n
+    rows, cols, index = _integers(memory, i, n), _integers(memory, i + n, n), _integers(memory, i + 2 * n, n)
     Ms, zs = numba.carray(_pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(_pointer(z_at, 0.0), (B, n))
     bases, statuses = numba.carray(_pointer(basis_at, False), (B, n)), numba.carray(_pointer(status_at, 0), (B,))
     grads_z, grads_w = numba.carray(_pointer(grad_z_at, 0.0), (B, n)), numba.carray(_pointer(grad_w_at, 0.0), (B, n))
