@@ -835,14 +835,15 @@ def _solve_one(
 
     Stages: 0 block pivoting, where it is the faster; 1 Lemke's method; 2 block pivoting from there, unless the residual
     is that of rounding; with rows and columns scaled apart 3 block pivoting and 4, 5, 6 Lemke's method; 7 interior
-    point. What is infeasible is found out when Lemke's method first ends on a ray.
+    point; 8 its solution refined, unless the residual is that of rounding: at a singular basis that can make it worse.
+    What is infeasible is found out when Lemke's method first ends on a ray.
     """
     n = q.size
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
     s = _scale(M, q, r, c, S, p)
     stage = -1 if warm or n < 6 or n > 40 else 0
-    while stage < 7 and not (accepted and (stage != 1 or best <= 1e-3 * tol)):
-        stage = 7 if capped and (budget >= 0 or stage >= 4) else stage + 1
+    while stage < 8 and not (accepted and (stage % 6 != 1 or best <= 1e-3 * tol)):
+        stage = 7 if capped and stage < 7 and (budget >= 0 or stage >= 4) else stage + 1
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
             capped = True
@@ -860,7 +861,7 @@ def _solve_one(
             ended, count = _lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
             capped = ended == CAPPED
             _polish(S, p, basis, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
-        else:
+        elif stage == 7:
             for i in range(n):
                 r[i] = c[i] = d[i]
             s = _scale(M, q, r, c, S, p)
@@ -868,6 +869,10 @@ def _solve_one(
             count = _interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, min(80, left))
             for i in range(n):
                 basis[i] = z[i] > w[i]
+                z[i] = z[i] if basis[i] else 0.0
+            _evaluate(S, p, z, w, omega)
+        else:
+            count = 0
             _polish(S, p, basis, T, place, False, A, rows, cols, index, z, w, omega, x, y)
         used += count
         if (stage == 0 or stage == 2 or stage == 3) and ended != DONE:

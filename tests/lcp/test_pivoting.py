@@ -138,6 +138,18 @@ def test_published_cases_are_solved_or_recognised_as_unsolvable():
         check_contract(M[None], q[None], result)
 
 
+def test_published_cases_that_are_solvable_are_solved_when_their_data_are_rounded_to_float32():
+    cases = _published_cases()
+    if cases is None:
+        pytest.skip("lcp_cases.npz not found: set LCPLEARN_DATA to its folder")
+    for name, M, q, solvable in cases:
+        M, q = (x.astype(np.float32).astype(float) for x in (M, q))
+        if solvable == "yes" and np.isfinite(M).all():
+            result = solve(M, q, single_precision=True)
+            assert result.status[0] == Status.SOLVED, name
+            assert natural_residual(M, q, result.z[0]) <= 1e-5 * np.abs(q).max(), name
+
+
 HARD = {
     "Murty, large q": problems.murty(12),
     "Murty, q = -1": problems.murty(20, easy=True),
