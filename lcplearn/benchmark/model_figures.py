@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SMALLEST, LARGEST = 1e-16, 1e3  # [m/s] range drawn; diverged rollouts stand at its upper end
+SMALLEST_WITH_NOISE = 1e-4
 QUANTITIES = {"rollout_rmse_100": "100-step rollout error [m/s]", "stick_accuracy": "sticks predicted exactly"}
 
 
@@ -54,7 +55,7 @@ def against_time(rows: Sequence[Row], names: Sequence[str]) -> "Figure":
                     if own:
                         _dot(ax, name, summary(own, cost), summary(own, quantity))
                 _decades(ax, [float(row[cost]) for row in rows])
-                _quantity_axis(ax, quantity)
+                _quantity_axis(ax, quantity, noise)
                 if i == 0:
                     ax.set_title(f"noise {noise:g} m/s", fontsize=10)
                     ax.tick_params(labelbottom=False)
@@ -62,8 +63,7 @@ def against_time(rows: Sequence[Row], names: Sequence[str]) -> "Figure":
                     ax.set_xlabel(cost_label, fontsize=9)
                 if 2 * j + k == 0:
                     ax.set_ylabel(label, fontsize=9)
-                else:
-                    ax.tick_params(labelleft=False)
+                ax.tick_params(labelleft=k == 0)
     one_legend(figure, axes, columns=4)
     return figure
 
@@ -86,12 +86,12 @@ def _decades(ax: "Axes", values: Sequence[float]) -> None:
         ax.set_xlim(10 ** np.floor(finite.min()), min(10 ** (np.floor(finite.max()) + 1), 1e6))
 
 
-def _quantity_axis(ax: "Axes", quantity: str) -> None:
+def _quantity_axis(ax: "Axes", quantity: str, noise: float) -> None:
     if quantity == "stick_accuracy":
         ax.set_ylim(-0.05, 1.05)
     else:
         ax.set_yscale("log")
-        ax.set_ylim(SMALLEST / 5, LARGEST * 3)
+        ax.set_ylim((SMALLEST_WITH_NOISE if noise else SMALLEST) / 5, LARGEST * 3)
 
 
 def against_samples(rows: Sequence[Row], names: Sequence[str]) -> "Figure":
@@ -101,17 +101,20 @@ def against_samples(rows: Sequence[Row], names: Sequence[str]) -> "Figure":
     for j, noise in enumerate(noises):
         for i, (quantity, label) in enumerate(QUANTITIES.items()):
             ax = axes[i, j]
-            for name in names:
+            for at, name in enumerate(names):
                 own = [row for row in rows if (row["model"], row["noise"]) == (name, noise)]
                 sizes = sorted({float(row["size"]) for row in own})
                 if not sizes:
                     continue
                 points = [summary([row for row in own if row["size"] == size], quantity) for size in sizes]
                 middle, low, high = np.array(points).T
-                ax.plot(sizes, middle, label=name, markersize=4, linewidth=1.2, **look(name))
-                ax.fill_between(sizes, low, high, color=look(name)["color"], alpha=0.12, linewidth=0)
+                beside = np.array(sizes) * 1.04 ** (at - len(names) / 2)  # so that bars do not hide one another
+                ax.errorbar(
+                    beside, middle, yerr=(middle - low, high - middle), label=name,
+                    markersize=4, linewidth=1.0, elinewidth=0.6, **look(name),
+                )  # fmt: skip
             ax.set_xscale("log")
-            _quantity_axis(ax, quantity)
+            _quantity_axis(ax, quantity, noise)
             if i == 0:
                 ax.set_title(f"noise {noise:g} m/s", fontsize=10)
             else:

@@ -140,7 +140,7 @@ def report(study: Study, left_out: str) -> None:
     )
     study.say(
         "How much data does a formulation need?",
-        "Error of a 100-step rollout and sticks predicted exactly; bands from the smallest to the largest seed.",
+        "Error of a 100-step rollout and sticks predicted exactly; bars from the smallest to the largest seed.",
         figure=model_figures.against_samples(rows, names),
     )
     slides = [row for row in study.rows if row["part"] == "slides"]
