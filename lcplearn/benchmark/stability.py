@@ -155,14 +155,14 @@ def report(study: Study, left_out: str) -> None:
     cases = [row for row in study.rows if row["part"] == "case" and row["verdict"] != ""]
     counts = Counter((row["method"], row["verdict"]) for row in cases)
     methods = [method for method in METHODS if any(row["method"] == method for row in cases)]
-    wrong = sum(counts[method, "wrong"] for method in methods)
+    wrong = ", ".join(f"{counts[method, 'wrong']} by {method}" for method in methods if counts[method, "wrong"])
     study.say(
         "Which method survives hard problems?",
-        f"{wrong} answers are wrong: a claim to have solved what is not, or an answer that depends on its neighbours "
-        "in the batch although it is unique. inexact: more than the case's tolerance from the known solution. gives "
-        "up: says that it failed where there is a solution, or lacks the proof that there is none. batch: answers "
-        "that move by more than 1e-12 when copies and an infeasible problem join the batch. Gradients are held "
-        f"against one-sided differences where the solution is unique. {left_out}".strip(),
+        f"Wrong answers: {wrong or 'none'} (a claim to have solved what is not, or an answer that depends on its "
+        "neighbours in the batch although it is unique). inexact: more than the case's tolerance from the known "
+        "solution. gives up: says that it failed where there is a solution, or lacks the proof that there is none. "
+        "batch: answers that move by more than 1e-12 when copies and an infeasible problem join the batch. Gradients "
+        f"are held against one-sided differences where the solution is unique. {left_out}".strip(),
         table=Table(
             ("method", "cases", *VERDICTS, "batch", "residual / allowed", "gradients", "median error", "worst error"),
             [_method_row(method, cases, counts) for method in methods],

@@ -78,10 +78,10 @@ def noise_maps(rows: Sequence[Row]) -> "Figure":
     figure, axes = new_figure(2, 2, width=7.5, height=5.8)
     for ax, push in zip(axes[0], noise_study.PUSHES, strict=True):
         values = np.array([[found[form, push, "all", sigma] for sigma in sigmas] for form in forms])
-        labels = [f"$10^{{{round(np.log10(sigma))}}}$" for sigma in sigmas]
+        labels = [str(round(np.log10(sigma))) for sigma in sigmas]
         image = heat_map(ax, values, forms, labels, _words(values), cmap="cividis", vmin=0, vmax=1)
         ax.set_title(f"noise on all entries, {_push(push)}", fontsize=10)
-        ax.set_xlabel(r"noise $\sigma$", fontsize=9)
+        ax.set_xlabel(r"noise, $\log_{10} \sigma$", fontsize=9)
         ax.tick_params(axis="x", rotation=0)
     axes[0, 1].set_yticklabels([])
     for ax, push in zip(axes[1], noise_study.PUSHES, strict=True):
@@ -102,4 +102,9 @@ def _push(push: str) -> str:
 
 
 def _words(values: np.ndarray) -> np.ndarray:
-    return np.array([[f"{value:.2f}".replace("1.00", "1").replace("0.00", "0") for value in row] for row in values])
+    return np.array(
+        [
+            [f"{value:.2f}".removeprefix("0") if 0.005 < value < 0.995 else f"{value:.0f}" for value in row]
+            for row in values
+        ]
+    )
