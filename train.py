@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 DEBUGGING = os.environ.get("HYDRA_FULL_ERROR") == "1"
+PROCESSES = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1  # torchrun's
 MISTAKES = (HydraException, OmegaConfBaseException, ValueError, OSError)
 CONF = Path(__file__).parent / "conf"
 
@@ -35,7 +36,7 @@ def train(config: DictConfig) -> float:
 
     run = HydraConfig.get()
     settings = OmegaConf.to_container(config, resolve=True)
-    check(settings, CONF, multirun=run.mode.name == "MULTIRUN")
+    check(settings, CONF, multirun=run.mode.name == "MULTIRUN", processes=PROCESSES)
 
     import torch
     from lightning import seed_everything
@@ -87,8 +88,12 @@ def sentence(error: BaseException) -> str:
 if __name__ == "__main__":
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
     try:
+        if PROCESSES > 1:
+            from lcplearn.training.settings import check_torchrun
+
+            check_torchrun(sys.argv[1:])
         main()
-    except MISTAKES as error:
+    except (*MISTAKES, KeyboardInterrupt) as error:
         if DEBUGGING:
             raise
         sys.exit(sentence(error))

@@ -6,7 +6,7 @@ Settings are plain dictionaries here: only train.py knows Hydra. What a `_target
 import ast
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,14 @@ class SettingsError(ValueError):
     """A mistake in the settings; the message is one sentence for the person who wrote them."""
 
 
-def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) -> None:
+def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, processes: int = 1) -> None:
     """Refuse settings that can't be what was meant.
 
     Args:
         settings: The resolved settings of a run.
         conf: Folder of the configuration, whose train.yaml and folders name what may stand at the top level.
         multirun: True in a sweep.
+        processes: How many torchrun started.
 
     Raises:
         SettingsError: the first mistake found.
@@ -57,10 +58,42 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False) ->
         epochs = settings["trainer"].get(key, 1)
         if epochs is None or epochs < 1:
             raise SettingsError(f"trainer.{key} must be at least 1, got {epochs}.")
-    strategy = str(settings["trainer"].get("strategy", "auto"))
-    if multirun and strategy.startswith("ddp") and not strategy.startswith(("ddp_fork", "ddp_spawn")):
-        raise SettingsError(f"A sweep (-m) can't run with trainer.strategy={strategy}: use trainer.strategy=ddp_fork.")
+    _check_processes(settings["trainer"], multirun, processes)
     _check_checkpoint(settings.get("ckpt_path"))
+
+
+def check_torchrun(arguments: Sequence[str]) -> None:
+    """Refuse a command whose processes, started by torchrun, would not write to one folder.
+
+    Args:
+        arguments: The command line; Hydra makes the folder before `check` is called.
+
+    Raises:
+        SettingsError: a sweep, or a folder that each process would name after its own clock.
+    """
+    if not {"-m", "--multirun"}.isdisjoint(arguments):
+        raise SettingsError("torchrun trains one run: sweep (-m) without it, with trainer.strategy=ddp_fork.")
+    if not any(argument.startswith("hydra.run.dir=") for argument in arguments):
+        raise SettingsError("torchrun's processes need one folder: add hydra.run.dir=runs/NAME.")
+
+
+def _check_processes(trainer: Mapping[str, Any], multirun: bool, processes: int) -> None:
+    """Several processes train together, and none starts the sweep again."""
+    strategy, devices = str(trainer.get("strategy", "auto")), trainer.get("devices", 1)
+    count = len(devices) if isinstance(devices, list) else devices  # a list names them
+    forks = strategy.startswith(("ddp_fork", "ddp_spawn"))
+    starts_again = not forks and (strategy.startswith("ddp") or count != 1)  # Lightning's auto is ddp for several
+    if multirun and starts_again:
+        raise SettingsError(
+            f"A sweep (-m) can't run with trainer.strategy={strategy} and trainer.devices={devices}: "
+            "use trainer.strategy=ddp_fork, or trainer.strategy=auto and one device."
+        )
+    alone = forks or not strategy.startswith("ddp")
+    if processes > 1 and (alone or not isinstance(count, int) or count * trainer.get("num_nodes", 1) != processes):
+        raise SettingsError(
+            f"torchrun started {processes} processes: set trainer.strategy=ddp and trainer.devices={processes}, "
+            "or on several nodes each one's trainer.devices and +trainer.num_nodes."
+        )
 
 
 def _check_friction(settings: Mapping[str, Any]) -> None:
@@ -189,6 +222,8 @@ def explain(message: str, conf: Path) -> str:
     missing = re.search(r"Could not find '([\w./]+)/([\w.-]+)'", message)
     if missing:
         group, choice = missing[1], missing[2]
+        if group == "hydra/launcher":
+            return f"There is no {group}={choice} among the installed ones; joblib's is in the extra 'sweep'."
         options = [file.stem for file in (conf / group).glob("*.yaml")]
         return f"There is no {group}={choice}; {_suggestion(choice, options)}"
     if unknown:

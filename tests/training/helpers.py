@@ -1,5 +1,8 @@
-"""Small data and short trainings, shared by the training tests."""
+"""Small data, short trainings and train.py as a user runs it, shared by the training tests."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +11,7 @@ from lcplearn.training import Optimizer, Result, fit
 
 ROOT = Path(__file__).parents[2]
 QUIET = {"enable_progress_bar": False}
+SMALL = ["data.trajectories=4", "data.length=30", "+data.long_length=20", "trainer.check_val_every_n_epoch=1"]
 
 
 def small_data(**arguments: Any) -> BlockData:
@@ -24,3 +28,15 @@ def short_fit(model: Any, data: BlockData, folder: Path, **arguments: Any) -> Re
     chosen: dict[str, Any] = {"epochs": 4, "optimizer": Optimizer(lbfgs_after=2, lbfgs_iterations=3)}
     chosen |= {"trainer": QUIET | {"check_val_every_n_epoch": 1}} | arguments
     return fit(model, data, folder=folder, **chosen)
+
+
+def environment(**more: str) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "COLUMNS": "120"} | more
+
+
+def train(
+    folder: Path, *overrides: str, launcher: tuple[str, ...] = (), **more: str
+) -> subprocess.CompletedProcess[str]:
+    """Run train.py in a folder, by itself or by a launcher, with more environment variables."""
+    command = [sys.executable, *launcher, str(ROOT / "train.py"), *overrides]
+    return subprocess.run(command, cwd=folder, env=environment(**more), capture_output=True, text=True, timeout=120)

@@ -100,12 +100,24 @@ def test_a_missing_checkpoint_is_compared_with_those_that_are_there(tmp_path: Pa
         checks.check(settings(f"ckpt_path={tmp_path / 'lst.ckpt'}"), CONF)
 
 
-def test_a_sweep_refuses_the_strategy_that_would_start_it_twice() -> None:
-    chosen = settings("trainer.strategy=ddp")
+@pytest.mark.parametrize("overrides", ["trainer.strategy=ddp", "trainer.devices=2", "trainer.devices=[0,1]"])
+def test_a_sweep_refuses_processes_that_would_start_it_again(overrides: str) -> None:
+    chosen = settings(*overrides.split())
     checks.check(chosen, CONF)
     with pytest.raises(checks.SettingsError, match=r"use trainer\.strategy=ddp_fork"):
         checks.check(chosen, CONF, multirun=True)
-    checks.check(settings("trainer.strategy=ddp_fork"), CONF, multirun=True)
+    for allowed in ("trainer.devices=1", "trainer.devices=[0]", "trainer.strategy=ddp_fork trainer.devices=2"):
+        checks.check(settings(*allowed.split()), CONF, multirun=True)
+
+
+@pytest.mark.parametrize("more", ["", "devices=2", "strategy=ddp", "strategy=ddp_fork devices=2"])
+def test_processes_of_torchrun_that_would_each_train_alone_are_refused(more: str) -> None:
+    chosen = settings(*(f"trainer.{setting}" for setting in more.split()))
+    with pytest.raises(checks.SettingsError, match=r"started 2 processes: set trainer\.strategy=ddp and .*devices=2"):
+        checks.check(chosen, CONF, processes=2)
+    together = ["trainer.strategy=ddp", "trainer.devices=2"]
+    checks.check(settings(*together), CONF, processes=2)
+    checks.check(settings(*together, "+trainer.num_nodes=3"), CONF, processes=6)
 
 
 @pytest.mark.parametrize(
@@ -113,6 +125,10 @@ def test_a_sweep_refuses_the_strategy_that_would_start_it_twice() -> None:
     [
         ("modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
         ("model=mpl", "There is no model=mpl; did you mean 'mlp'?"),
+        (
+            "hydra/launcher=jobl",
+            "There is no hydra/launcher=jobl among the installed ones; joblib's is in the extra 'sweep'.",
+        ),
         ("data.gravity=1.62", "'data.gravity' is not set in conf/data; to add it, write +data.gravity=..."),
         ("model.widht=3", "Unknown setting 'model.widht'; did you mean 'model.width'?"),
         ("trainer.max_epoch=3", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),

@@ -1,7 +1,6 @@
 """train.py as a user runs it; each call pays the imports, so there are few."""
 
 import json
-import os
 import re
 import signal
 import subprocess
@@ -10,22 +9,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from training.helpers import ROOT, short_fit
+from training.helpers import ROOT, SMALL, environment, short_fit, train
 
 from lcplearn.datasets import simulate_sliding_block
 from lcplearn.formulations import Physical
 from lcplearn.training import Optimizer
-
-SMALL = ["data.trajectories=4", "data.length=30", "+data.long_length=20", "trainer.check_val_every_n_epoch=1"]
-
-
-def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
-
-
-def train(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "train.py"), *overrides]
-    return subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=120)
 
 
 def test_a_mistyped_setting_ends_in_one_sentence_without_torch(tmp_path: Path) -> None:
