@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lcplearn.lcp.residuals import EPS, equilibrate, judge, two_sided_scales
+from lcplearn.lcp.residuals import EPS, equilibrate, judge, multiply, two_sided_scales
 
 DEFAULT_MAX_ITER = 100
 POLISH_BELOW = 1e-6  # try the basis once the merit is this small: earlier tries fail, later ones waste iterations
@@ -84,8 +84,8 @@ class _Best(NamedTuple):
         """Take points that are better than those held, their zeros made exact; returns their residual."""
         basis = basis & (z > 0)
         z = torch.where(basis, z, 0.0)
-        w = _multiply(S, z) + p
-        noise = 8 * EPS * (p.abs() + _multiply(S.abs(), z))
+        w = multiply(S, z) + p
+        noise = 8 * EPS * (p.abs() + multiply(S.abs(), z))
         w = torch.where(basis | (w <= noise), 0.0, w)
         error = judge(S, p, z, tol=EXACT).residual
         better = error < self.error[index]
@@ -103,7 +103,7 @@ def _follow_path(S: Tensor, p: Tensor, tau: Tensor, max_iter: int) -> tuple[_Bes
     smoothed = bool((tau > 0).any())
     a = _Active(index, S, p, tau, z=ones, w=ones, gap=infinite, since=iterations.clone())
     for iteration in range(max_iter + 1):
-        r = _multiply(a.S, a.z) + a.p - a.w
+        r = multiply(a.S, a.z) + a.p - a.w
         gap, infeasibility = (a.z * a.w - a.tau).abs().amax(-1), r.abs().amax(-1)
         halved = gap < 0.5 * a.gap
         a.gap, a.since = torch.where(halved, gap, a.gap), torch.where(halved, 0, a.since + 1)
@@ -146,7 +146,7 @@ def _predict_and_correct(a: _Active, r: Tensor) -> tuple[Tensor, Tensor]:
 
     def direction(rhs: Tensor) -> tuple[Tensor, Tensor]:
         dz = torch.linalg.lu_solve(factors, pivots, rhs.unsqueeze(-1)).squeeze(-1)
-        return dz, _multiply(a.S, dz) + r
+        return dz, multiply(a.S, dz) + r
 
     mu = (a.z * a.w).mean(-1, keepdim=True)
     dz, dw = direction(a.tau / a.z - r - a.w)
@@ -195,9 +195,9 @@ def _correct_basis(S: Tensor, p: Tensor, best: _Best) -> None:
     member = torch.arange(p.shape[-1], device=p.device)
     for _ in range(3 * p.shape[-1] + 20):
         z = solve_on_basis(S, p, z, basis)
-        w = _multiply(S, z) + p
+        w = multiply(S, z) + p
         error = best.offer(index, S, p, z, basis)
-        omega = p.abs() + _multiply(S.abs(), z.abs())
+        omega = p.abs() + multiply(S.abs(), z.abs())
         wrong = torch.where(basis, z < -8 * EPS * z.abs().amax(-1, keepdim=True), w < -8 * EPS * omega)
         count = wrong.sum(-1)
         go_on = (count > 0) & (error > EXACT) & z.isfinite().all(-1)
@@ -228,10 +228,6 @@ def solve_on_basis(S: Tensor, p: Tensor, z: Tensor, basis: Tensor) -> Tensor:
         factors, pivots, _ = torch.linalg.lu_factor_ex(block + torch.diag_embed(ridge))
     z = torch.where(basis, z, 0.0)
     for _ in range(REFINEMENTS):
-        r = torch.where(basis, rows * (_multiply(S, z) + p), 0.0)
+        r = torch.where(basis, rows * (multiply(S, z) + p), 0.0)
         z = z - columns * torch.linalg.lu_solve(factors, pivots, r.unsqueeze(-1)).squeeze(-1)
     return z
-
-
-def _multiply(S: Tensor, x: Tensor) -> Tensor:
-    return (S @ x.unsqueeze(-1)).squeeze(-1)

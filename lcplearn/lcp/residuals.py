@@ -43,6 +43,14 @@ def default_tolerance(dtype: torch.dtype) -> float:
     return 2e-6 if dtype == torch.float32 else 1e-10
 
 
+def multiply(M: Float[Tensor, "*batch n n"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    """M x, summed in an order that does not depend on the batch, unlike `@`.
+
+    An element's rounding must not depend on its neighbours: it chooses between the solutions where there are several.
+    """
+    return (M * x.unsqueeze(-2)).sum(-1)
+
+
 def equilibrate(M: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n"]:
     """Positive d such that rows and columns of d_i M_ij d_j have largest entries near 1 (symmetric Ruiz scaling).
 
@@ -96,8 +104,7 @@ def judge(
     if M.shape[-1] == 0:
         zero = torch.zeros(q.shape[:-1], dtype=q.dtype, device=q.device)
         return Judgement(zero, zero + tol)
-    Mz = (M @ z.unsqueeze(-1)).squeeze(-1)
-    absMz = (M.abs() @ z.abs().unsqueeze(-1)).squeeze(-1)
+    Mz, absMz = multiply(M, z), multiply(M.abs(), z.abs())
     w = Mz + q
     d = equilibrate(M)
     q_size = (d * q).abs().amax(-1).clamp_min(max(TINY, smoothing**0.5))

@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import arrays
 from lcp.oracles import FAMILIES, has_solution, natural_residual, planted, random_family
 
 from lcplearn import Status, solve_lcp
+from lcplearn.benchmark import problems
 
 METHODS = ("pivoting", "interior_point")
 entries = st.integers(-3, 3)
@@ -161,6 +162,16 @@ def test_batch_equals_its_elements_one_by_one_beside_unsolvable_and_non_finite_m
         assert alone.status == batch.status[k]
         assert torch.equal(alone.basis, batch.basis[k])
         torch.testing.assert_close(alone.z, batch.z[k], rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_solution_chosen_of_several_does_not_depend_on_the_batch(method):
+    """Stacked cubes have redundant contacts: another order of summation would end in other contact forces."""
+    M, q = (torch.from_numpy(x) for x in problems.stacked_cubes(np.random.default_rng(0), 24)[:2])
+    batch = solve_lcp(M, q, method=method)
+    for k in range(24):
+        alone = solve_lcp(M[k], q[k], method=method)
+        torch.testing.assert_close(alone.z, batch.z[k], rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("method", METHODS)
