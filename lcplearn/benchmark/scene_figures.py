@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lcplearn.benchmark.figures import BLACK, BLUE, GREEN, ORANGE, RED, SKY, Style, new_figure, one_legend
+from lcplearn.benchmark.figures import BLACK, BLUE, GREEN, RED, SKY, Style, new_figure, one_legend
 from lcplearn.benchmark.study import Row
 
 if TYPE_CHECKING:
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 LOOKS = {
     "closed form": Style(GREEN, "^"),
     "direct": Style(BLUE, "o"),
-    "direct, by pivoting": Style(ORANGE, "P", "-."),
     "physical slack": Style(SKY, "v", "--"),
     "traditional": Style(RED, "s"),
     "full": Style(BLACK, "D", ":"),
