@@ -35,11 +35,13 @@ def time_bars(rows: Sequence[Row]) -> "Figure":
     for ax, batch in zip(axes[0], batches, strict=True):
         for name, look in LOOKS.items():
             own = [row for row in rows if (row["formulation"], row["batch"]) == (name, batch)]
-            at = [scenes.index(str(row["scene"])) + 0.14 * (list(LOOKS).index(name) - 2.5) for row in own]
+            at = [
+                scenes.index(str(row["scene"])) + 0.16 * (list(LOOKS).index(name) - (len(LOOKS) - 1) / 2) for row in own
+            ]
             middle, low, high = (
                 np.array([float(row[column]) for row in own]) for column in ("step_us", "step_low_us", "step_high_us")
             )
-            ax.bar(at, middle, 0.13, color=look.color, label=name, yerr=(middle - low, high - middle), ecolor="#777777")
+            ax.bar(at, middle, 0.15, color=look.color, label=name, yerr=(middle - low, high - middle), ecolor="#777777")
         ax.set_xticks(range(len(scenes)), [scene.replace(" ", "\n") for scene in scenes], fontsize=9)
         ax.set_title(f"batch {batch:g}", fontsize=10)
     axes[0, 0].set_ylabel("time of a step of one block [µs]")

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from lcplearn.lcp.methods import Options, pivoting_kernel, pivots, plain, solve
+from lcplearn.lcp.methods import Options, pivoting_kernel, pivots, plain, solve, traced
 from lcplearn.lcp.residuals import two_sided_scales
 from lcplearn.lcp.solution import LCPSolution, Status
 
@@ -145,8 +145,10 @@ def adjoint(
 
 
 def _differentiated(grad_z: Tensor | None, grad_w: Tensor | None) -> bool:
-    """Whether somebody wants a derivative of the backward, or maps it: then it has to be made of torch's operations."""
-    if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+    """Whether somebody differentiates, maps or traces the backward: then it has to be made of torch's operations."""
+    if torch.is_grad_enabled() or forward_ad._current_level >= 0 or traced():
+        return True
+    if torch._C._are_functorch_transforms_active():
         return True
     mapped = torch._C._functorch.is_legacy_batchedtensor
     return (grad_z is not None and mapped(grad_z)) or (grad_w is not None and mapped(grad_w))
@@ -166,8 +168,8 @@ def _adjoint_in_kernel(
     grad_M, grad_q = kernel.solve_adjoint(
         plain(M),
         plain(z),
-        basis.contiguous(),
-        status,
+        basis.bool().contiguous(),  # what hooks on saved tensors give back may have another type and layout
+        status.long().contiguous(),
         None if grad_z is None else plain(grad_z),
         None if grad_w is None else plain(grad_w),
         need_M,

@@ -92,10 +92,9 @@ def solve_batch(
     """
     shape = q.shape
     batch, n = shape[:-1], shape[-1]
-    tensor, empty = torch.from_numpy, np.empty  # faster than torch.empty
-    z, w, basis = tensor(empty(shape)), tensor(empty(shape)), tensor(empty(shape, np.bool_))
-    status, iterations = tensor(empty(batch, np.int64)), tensor(empty(batch, np.int64))
-    residual, certificate = tensor(empty(batch)), tensor(empty(shape))
+    z, w, certificate = _empty(shape), _empty(shape), _empty(shape)
+    basis, residual = _empty(shape, np.bool_), _empty(batch)
+    status, iterations = _empty(batch, np.int64), _empty(batch, np.int64)
     if initial_basis is not None:
         basis.copy_(initial_basis)
     if tol is None:
@@ -104,8 +103,8 @@ def solve_batch(
     _announce_compilation()
     _solve_range(
         status.numel(), n, M.dim() == 2, address(M), address(q), tol, single_precision, budget,
-        initial_basis is not None, empty(3 * n * n + 27 * n + 18), z.data_ptr(), w.data_ptr(), basis.data_ptr(),
-        residual.data_ptr(), status.data_ptr(), iterations.data_ptr(), certificate.data_ptr(),
+        initial_basis is not None, np.empty(3 * n * n + 25 * n + 13), address(z), address(w), address(basis),
+        address(residual), address(status), address(iterations), address(certificate),
     )  # fmt: skip
     return LCPSolution(z, w, basis, status, residual, iterations, certificate)
 
@@ -138,23 +137,30 @@ def solve_adjoint(
         interior point), y solves the consistent part of the equations: the gradient of unique quantities is exact.
     """
     n = z.shape[-1]
-    grad_q = torch.from_numpy(np.empty(z.shape))
-    grad_M = torch.from_numpy(np.empty(M.shape)) if need_M else None
+    grad_q, grad_M = _empty(z.shape), _empty(M.shape) if need_M else None
     _adjoint_range(
         status.numel(), n, M.dim() == 2, address(M), address(z), address(basis), address(status), address(grad_z),
-        address(grad_w), np.empty(n * n + 7 * n), single_precision, 0 if grad_M is None else grad_M.data_ptr(),
-        grad_q.data_ptr(),
+        address(grad_w), np.empty(n * n + 7 * n), single_precision, address(grad_M), address(grad_q),
     )  # fmt: skip
     return grad_M, grad_q
 
 
+def _empty(shape: tuple[int, ...], dtype: type = np.float64) -> Tensor:
+    """An uninitialised tensor on the CPU, in half the time that torch.empty takes."""
+    return torch.from_numpy(np.empty(shape, dtype))
+
+
 def address(x: Tensor | None) -> int:
-    """Where a tensor's numbers are, for the kernel; 0 for None. One that has none, as under a tracer, raises."""
+    """Where a tensor's numbers are, for the kernel; 0 for None. The caller holds the tensor until the kernel returns.
+
+    Raises:
+        RuntimeError: The tensor has no memory.
+    """
     if x is None:
         return 0
     result = x.data_ptr()
     if result == 0 and x.numel():
-        raise RuntimeError("a tensor without memory (traced or fake) reached the LCP kernel")
+        raise RuntimeError("a tensor without memory (fake, traced or torch's implicit zero) reached the LCP kernel")
     return result
 
 
@@ -174,8 +180,8 @@ def _announce_compilation() -> None:
 #
 # numba counts references, atomically, for every array passed from function to function, and that takes longer than
 # solving a small problem (0.4 us instead of 0.2 for n = 2). So the kernels see bare views. Lifetime: a view is made
-# inside a call of `_solve_range` or `_adjoint_range`, from an argument that their caller holds until they return, and
-# never leaves them.
+# inside a call of `_solve_range` or `_adjoint_range`, from the address of a tensor, or from scratch memory, that their
+# caller holds until they return, and never leaves them.
 
 
 def _pointer_code(_, address, example):
@@ -214,13 +220,13 @@ _add_multiple: Any = intrinsic(_add_multiple_code)
 @_jit
 def _matrix(memory, start, rows, columns):
     """View of part of a vector of doubles."""
-    return numba.carray(_pointer(memory.ctypes.data + 8 * start, memory[0]), (rows, columns))
+    return numba.carray(_pointer(memory.ctypes.data + 8 * start, 0.0), (rows, columns))
 
 
 @_jit
 def _vector(memory, start, size):
     """View of part of a vector of doubles."""
-    return numba.carray(_pointer(memory.ctypes.data + 8 * start, memory[0]), (size,))
+    return numba.carray(_pointer(memory.ctypes.data + 8 * start, 0.0), (size,))
 
 
 @_jit
@@ -842,7 +848,7 @@ def _solve_one(
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
     s = _scale(M, q, r, c, S, p)
     stage = -1 if warm or n < 6 or n > 40 else 0
-    while stage < 8 and not (accepted and (stage % 6 != 1 or best <= 1e-3 * tol)):
+    while stage < 8 and not (accepted and (not (stage == 1 or stage == 7) or best <= 1e-3 * tol)):
         stage = 7 if capped and stage < 7 and (budget >= 0 or stage >= 4) else stage + 1
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
@@ -881,7 +887,7 @@ def _solve_one(
         if residual > limit and _drop_noise(z, w, omega, S, tol):
             _evaluate(S, p, z, w, omega)
             residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
-        if residual < best:
+        if residual < best and (residual <= limit or not accepted):
             _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
             best, accepted = residual, residual <= limit and _all_finite(z_out) and _all_finite(w_out)
         if ended == STUCK and not asked and not accepted:
@@ -912,10 +918,11 @@ def _solve_range(
     us, bases = numba.carray(_pointer(u_at, 0.0), (B, n)), numba.carray(_pointer(basis_at, False), (B, n))
     residuals, statuses = numba.carray(_pointer(residual_at, 0.0), (B,)), numba.carray(_pointer(status_at, 0), (B,))
     iterations = numba.carray(_pointer(iterations_at, 0), (B,))
-    i = f + 11 * n + 2 + width
-    rows, cols, index = _integers(scratch, i, n), _integers(scratch, i + n, n), _integers(scratch, i + 2 * n, n)
-    basic, basis = _integers(scratch, i + 3 * n, n), _integers(scratch, i + 4 * n, n)
-    column, place = _integers(scratch, i + 5 * n, n + 1), _integers(scratch, i + 6 * n + 1, 2 * n + 1)
+    f += 11 * n + 2 + width
+    rows, cols, index = _integers(scratch, f, n), _integers(scratch, f + n, n), _integers(scratch, f + 2 * n, n)
+    basic, basis = _integers(scratch, f + 3 * n, n), _integers(scratch, f + 4 * n, n)
+    column, place = _integers(scratch, f + 5 * n, n + 1), _integers(scratch, f + 6 * n + 1, 2 * n + 1)
+    # and that is all of it: at most 3 n^2 + 25 n + 13 numbers, as width <= n + 3
     for b in range(B):
         Mb, qb = Ms[0 if shared else b], qs[b]
         for i in range(n):  # until a stage has a candidate
@@ -958,16 +965,16 @@ def _equilibrate_rows_and_columns(A, k, r, s):
 
 @_jit
 def _adjoint_range(
-    B, n, shared, M_at, z_at, basis_at, status_at, grad_z_at, grad_w_at, memory, single_precision,
+    B, n, shared, M_at, z_at, basis_at, status_at, grad_z_at, grad_w_at, scratch, single_precision,
     grad_M_at, grad_q_at
 ):  # fmt: skip
     """The adjoint of each element; see `solve_adjoint`. The address of what is not there is 0."""
     singular, dependent = (n * 1e-7, 1e-5) if single_precision else (n * EPS, 1e-11)
-    A = _matrix(memory, 0, n, n)
-    x, scratch = _vector(memory, n * n, n), _vector(memory, n * n + n, n)
-    r, s = _vector(memory, n * n + 2 * n, n), _vector(memory, n * n + 3 * n, n)
-    i = n * n + 4 * n
-    rows, cols, index = _integers(memory, i, n), _integers(memory, i + n, n), _integers(memory, i + 2 * n, n)
+    A = _matrix(scratch, 0, n, n)
+    x, rest = _vector(scratch, n * n, n), _vector(scratch, n * n + n, n)
+    r, s = _vector(scratch, n * n + 2 * n, n), _vector(scratch, n * n + 3 * n, n)
+    f = n * n + 4 * n
+    rows, cols, index = _integers(scratch, f, n), _integers(scratch, f + n, n), _integers(scratch, f + 2 * n, n)
     Ms, zs = numba.carray(_pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(_pointer(z_at, 0.0), (B, n))
     bases, statuses = numba.carray(_pointer(basis_at, False), (B, n)), numba.carray(_pointer(status_at, 0), (B,))
     grads_z, grads_w = numba.carray(_pointer(grad_z_at, 0.0), (B, n)), numba.carray(_pointer(grad_w_at, 0.0), (B, n))
@@ -989,7 +996,7 @@ def _adjoint_range(
                             x[a] -= Mb[i, index[a]] * y[i]
             for a in range(k):
                 x[a] *= r[a]
-            _solve(A, k, rank, rows, cols, x, scratch)
+            _solve(A, k, rank, rows, cols, x, rest)
             for a in range(k):
                 y[index[a]] = s[a] * x[a]
         if grad_M_at != 0:
@@ -1005,12 +1012,7 @@ def _adjoint_range(
 @_jit_inline
 def _factor_transpose(M, basis, A, r, s, rows, cols, index, singular, dependent):
     """LU of M_AA' with rows r and columns s scaled, by complete pivoting if it is singular; its size and rank."""
-    k = 0
-    for i in range(basis.size):
-        if basis[i]:
-            index[k] = i
-            k += 1
-    rank = -1
+    k, rank = _members(basis, index), -1
     for complete in range(2):
         for a in range(k):
             for c in range(k):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lcplearn.lcp.compiled import traced_solve
 from lcplearn.lcp.gradient import differentiable_solve
-from lcplearn.lcp.methods import Method, Options
+from lcplearn.lcp.methods import Method, Options, traced
 from lcplearn.lcp.residuals import default_tolerance
 from lcplearn.lcp.solution import LCPSolution
 
@@ -76,9 +76,8 @@ def solve_lcp(
         if method not in ("auto", "pivoting"):
             raise ValueError(f"initial_basis needs method 'pivoting' or 'auto'; got method {method!r}")
         initial_basis = _expand_basis(initial_basis, q)
-    options = Options(method, tol or default_tolerance(q.dtype), max_iter, smoothing)
-    traced = torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack()  # compile, export, make_fx, fakes
-    run = traced_solve if traced else differentiable_solve
+    options = Options(method, float(tol or default_tolerance(q.dtype)), max_iter, float(smoothing))
+    run = traced_solve if traced() else differentiable_solve
     solution = run(M, q, initial_basis, options)
     if throw:
         solution.raise_if_unsolved()

@@ -22,7 +22,7 @@ def solve(M, q, *, single_precision=False, max_iter=None, initial_basis=None, **
     """A batch by the kernel, from arrays to arrays."""
     M, q = np.asarray(M, dtype=float), np.asarray(q, dtype=float)
     M, q = M.reshape(-1, *M.shape[-2:]), q.reshape(-1, q.shape[-1])
-    M, q = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M[0] if len(M) == 1 else M, q))
+    M, q = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M[0] if len(M) < len(q) else M, q))
     basis = None if initial_basis is None else torch.as_tensor(initial_basis)
     result = pivoting.solve_batch(
         M, q, single_precision=single_precision, max_iter=max_iter, initial_basis=basis, **options

@@ -109,11 +109,16 @@ def test_operators_pass_the_operator_check_of_torch(shared):
             torch.library.opcheck(torch.ops.lcplearn.adjoint.default, arguments)
 
 
-def test_symbolic_tracers_see_one_operator_and_no_constant():
+@pytest.mark.parametrize("pre_dispatch", [False, True])
+def test_symbolic_tracers_see_one_operator_and_no_constant(pre_dispatch):
     """A solve that a tracer recorded as a constant would answer every later problem with the first one's solution."""
     M, q = 2 * torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
-    traced = make_fx(lambda M, q: solve_lcp(M, q).z)(M, q)
+    traced = make_fx(lambda M, q: solve_lcp(M, q).z, pre_dispatch=pre_dispatch)(M, q)
     torch.testing.assert_close(traced(M, 3 * q), solve_lcp(M, 3 * q).z)
+
+
+def test_fake_tensors_get_fake_solutions_of_the_right_shapes():
+    M, q = 2 * torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
     with FakeTensorMode() as mode:
         fake = solve_lcp(mode.from_tensor(M), mode.from_tensor(q))
     assert [x.shape for x in fake] == [x.shape for x in solve_lcp(M, q)]

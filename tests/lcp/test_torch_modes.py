@@ -7,6 +7,8 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 from lcp.oracles import planted, random_family
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
 
 import lcplearn.lcp
 from lcplearn import solve_lcp
@@ -117,6 +119,40 @@ def test_unusual_memory_is_read_right_and_never_written(method, transform):
     torch.testing.assert_close(*gradients)
     assert torch.equal(M, before[0])
     assert torch.equal(q, before[1])
+
+
+def test_modes_that_only_watch_leave_all_derivatives():
+    M, q = problem()
+    with FlopCounterMode(display=False):
+        watched = torch.func.jacrev(lambda q: solve_lcp(M, q).z)(q)
+    torch.testing.assert_close(watched, torch.func.jacrev(lambda q: solve_lcp(M, q).z)(q))
+
+
+def test_memory_that_a_mode_takes_away_is_an_error_and_no_crash():
+    class Meta(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            result = function(*args, **(kwargs or {}))
+            return result.to("meta") if "lift_fresh" in str(function) else result
+
+    M, q = problem()
+    z = solve_lcp(M, q.requires_grad_()).z
+    with Meta(), pytest.raises(RuntimeError, match="without memory"):
+        torch.autograd.grad(z.sum(), q)
+
+
+@pytest.mark.parametrize(
+    "pack",
+    [
+        lambda x: x.to(torch.int8) if x.dtype == torch.int64 else x,
+        lambda x: x.transpose(0, 1).contiguous().transpose(0, 1) if x.dim() > 1 else x[:, None].expand(-1, 2)[:, 0],
+    ],
+)
+def test_hooks_on_saved_tensors_may_change_type_and_layout(pack):
+    M, q = problem()
+    q.requires_grad_()
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
+        z = solve_lcp(M, q).z
+    torch.testing.assert_close(torch.autograd.grad(z.sum(), q), torch.autograd.grad(solve_lcp(M, q).z.sum(), q))
 
 
 def test_changing_the_matrix_between_forward_and_backward_is_an_error():
