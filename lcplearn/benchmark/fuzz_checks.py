@@ -14,7 +14,6 @@ EPS = np.finfo(np.float64).eps
 ENUMERATED = 5  # largest n whose 3^n patterns are tried
 TINY = 1e-307  # below it doubles lose digits, and no z can be right to many
 HUGE = 1e150  # products of two such numbers, or quotients, overflow
-FLOAT32_MAX = torch.finfo(torch.float32).max
 HUGE_FLOAT32 = 1e15
 EXTREME = 1e-3  # residual that is allowed to data beyond HUGE, which lose digits to underflow
 
@@ -186,9 +185,12 @@ def _check_solvable(batch: Batch, solution: LCPSolution) -> list[Finding]:
 
 
 def _check_gradient(name: str, M: torch.Tensor, q: torch.Tensor, **options: Any) -> list[Finding]:
-    """Gradients are finite, but for float32 overflow of true ones, and zero where unsolved."""
+    """Gradients are finite, unless that of M, grad_q z', overflows, and zero where unsolved."""
+    M, q = M.clone().requires_grad_(), q.clone().requires_grad_()
+    solution = solve_lcp(M, q, **options)
+    loss = torch.where(solution.solved, (solution.z + solution.w).sum(-1), 0.0).sum()
     try:
-        solution, gradients = _gradients(M, q, options)
+        gradients = torch.autograd.grad(loss, (M, q)) if loss.requires_grad else ()
     except RuntimeError as error:  # LinAlgError is one
         return [Finding(f"{name}: gradient raises", str(error), list(range(len(q))))]
     huge = np.sqrt(HUGE_FLOAT32 if M.dtype == torch.float32 else HUGE)  # h z' is of size q / M^2
@@ -196,23 +198,13 @@ def _check_gradient(name: str, M: torch.Tensor, q: torch.Tensor, **options: Any)
     for of, gradient in zip("Mq", gradients, strict=False):
         flat = gradient.reshape(len(q), -1)
         for b in torch.nonzero(~flat.isfinite().all(1)).flatten().tolist():
-            exact = _gradients(M[b].double(), q[b].double(), options)[1]
-            overflows = M.dtype == torch.float32 and any(bool((x.abs() > FLOAT32_MAX).any()) for x in exact)
-            if _within(M[b].numpy(), q[b].numpy(), huge) and not overflows:
+            product = gradients[1][b].abs().max().log() + solution.z[b].abs().max().log()
+            overflows = of == "M" and bool(product > np.log(torch.finfo(M.dtype).max))
+            if _within(M[b].detach().numpy(), q[b].detach().numpy(), huge) and not overflows:
                 findings.append(Finding(f"{name}: gradient not finite", f"with respect to {of}", [b]))
         for b in torch.nonzero((flat != 0).any(1) & ~solution.solved).flatten().tolist():
             findings.append(Finding(f"{name}: gradient of unsolved", f"with respect to {of}", [b]))
     return findings
-
-
-def _gradients(
-    M: torch.Tensor, q: torch.Tensor, options: dict[str, Any]
-) -> tuple[LCPSolution, tuple[torch.Tensor, ...]]:
-    """The solution, and the gradients of sum z + w over what is solved."""
-    M, q = M.clone().requires_grad_(), q.clone().requires_grad_()
-    solution = solve_lcp(M, q, **options)
-    loss = torch.where(solution.solved, (solution.z + solution.w).sum(-1), 0.0).sum()
-    return solution, torch.autograd.grad(loss, (M, q)) if loss.requires_grad else ()
 
 
 def enumerate_solution(M: np.ndarray, q: np.ndarray) -> np.ndarray | None:
