@@ -25,13 +25,13 @@ from lcplearn.benchmark.solver_figures import (
     draw_work_precision,
 )
 from lcplearn.benchmark.study import Options, Row, Study, Table, Value
-from lcplearn.lcp.residuals import default_tolerance, judge
+from lcplearn.lcp.residuals import default_tolerance
 
 Family = Callable[[np.random.Generator, int], Problems]
 KEY = ("family", "batch", "precision")
 COLUMNS = (
     "method", "n", "forward_us", "forward_low_us", "forward_high_us", "forward_cpu_us", "backward_us",
-    "backward_cpu_us", "residual", "worst_residual", "solved", "judged_solved", "gradient_error",
+    "backward_cpu_us", "residual", "worst_residual", "solved", "gradient_error",
     "worst_gradient_error", "peak_mb",
 )  # fmt: skip
 BATCHES, QUICK_BATCHES = (1, 10, 100, 1000, 10_000), (1, 100)
@@ -148,13 +148,11 @@ def _calls(data: Problems, dtype: torch.dtype, longest: float) -> Calls:
 
 def _residuals(data: Problems, z: Tensor, tolerance: float) -> dict[str, float]:
     M, q = torch.from_numpy(data.M), torch.from_numpy(data.q)
-    verdict = judge(M, q, z, tol=tolerance)
     natural = torch.minimum(z, (M @ z[..., None])[..., 0] + q).abs().amax(-1) / (1 + q.abs().amax(-1))
     return {
         "residual": float(natural.median()),
         "worst_residual": float(natural.max()),
         "solved": float((natural <= tolerance).double().mean()),
-        "judged_solved": float((verdict.residual <= verdict.tolerance).double().mean()),
     }
 
 
@@ -204,7 +202,7 @@ def _say(study: Study, batch: int) -> None:
         rows = [row for row in at_batch if row["precision"] == precision]
         columns = (
             "family", "method", "forward_us", "forward_cpu_us", "backward_us", "residual", "worst_residual", "solved",
-            "judged_solved", "gradient_error", "worst_gradient_error", "peak_mb",
+            "gradient_error", "worst_gradient_error", "peak_mb",
         )  # fmt: skip
         table = Table([c.replace("_", " ") for c in columns], [[row[c] for c in columns] for row in rows])
         study.say(f"All methods at batch {batch}, {precision}", missing_peers(), table=table)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from lcplearn.benchmark.methods import peers
-from lcplearn.lcp.residuals import default_tolerance, judge
+from lcplearn.lcp.residuals import default_tolerance, equilibrate, judge
 from lcplearn.lcp.solution import Status
 from lcplearn.lcp.solve import solve_lcp
 
@@ -28,7 +28,8 @@ class Answer(NamedTuple):
     Attributes:
         z: [B, n], float64.
         statuses: Names of `Status` values, of which a peer knows SOLVED and UNSOLVED; or RAISED and an error's name.
-        residual, tolerance: Ours, recomputed from z as it came back, and what it is held against: [B].
+        residual, tolerance: Ours, recomputed from z as it came back, and what it is held against: [B]. For a peer
+            `equilibrated_residual` and 1e-6.
     """
 
     z: np.ndarray
@@ -36,6 +37,8 @@ class Answer(NamedTuple):
     residual: np.ndarray
     tolerance: np.ndarray
 
+
+PEER_TOLERANCE = 1e-6  # what they claim to be solved may be this far off
 
 METHODS: tuple[str, ...] = (*OURS, *peers())
 
@@ -57,7 +60,8 @@ def _solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
         if q.shape[1] == 0:
             return None
         found = peers()[method](M, q)
-        return _judged(M, q, found.z, ["SOLVED" if claim else "UNSOLVED" for claim in found.claimed], torch.float64)
+        statuses = ["SOLVED" if claim else "UNSOLVED" for claim in found.claimed]
+        return Answer(found.z, statuses, equilibrated_residual(M, q, found.z), np.full(len(q), PEER_TOLERANCE))
     keywords, dtype = OURS[method]
     if method == "diagonal" and np.where(np.eye(M.shape[-1]) == 1, 0, M).any():
         return None
@@ -67,6 +71,18 @@ def _solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
     statuses = [Status(value).name for value in solution.status.tolist()]
     M, q, z = (x.double().numpy() for x in (*data, solution.z))
     return _judged(M, q, z, statuses, dtype, keywords.get("smoothing", 0.0))
+
+
+def equilibrated_residual(M: np.ndarray, q: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Part (a) of our residual alone: max |min(z, w)| / max |q| in units in which M has entries of size 1; inf for NaN.
+
+    Part (b) asks for the sign of rounding noise, of which peers promise nothing.
+    """
+    d = equilibrate(torch.from_numpy(np.ascontiguousarray(M))).numpy()
+    with np.errstate(all="ignore"):
+        w = (M @ z[..., None])[..., 0] + q
+        residual = np.abs(np.minimum(z / d, d * w)).max(-1) / np.maximum(np.abs(d * q).max(-1), 1e-300)
+    return np.where(np.isfinite(residual), residual, np.inf)
 
 
 def _judged(

@@ -75,7 +75,7 @@ def case_row(case: HardCase, method: str) -> Row:
     """What a method does with a case, and whether that is right.
 
     Returns:
-        status; residual as our judge recomputes it, also for peers, and what is allowed (of float32 more: z is
+        status; residual as recomputed (`solving.Answer`), and what is allowed (of float32 more: z is
         rounded); error of what is unique; gradient_error against finite differences; batch_safe: the same answer
         among copies of itself and an infeasible neighbour; verdict.
     """
@@ -158,11 +158,12 @@ def report(study: Study, left_out: str) -> None:
     wrong = ", ".join(f"{counts[method, 'wrong']} by {method}" for method in methods if counts[method, "wrong"])
     study.say(
         "Which method survives hard problems?",
-        f"Wrong answers: {wrong or 'none'} (a claim to have solved what is not, or an answer that depends on its "
-        "neighbours in the batch although it is unique). inexact: more than the case's tolerance from the known "
-        "solution. gives up: says that it failed where there is a solution, or lacks the proof that there is none. "
-        "batch: answers that move by more than 1e-12 when copies and an infeasible problem join the batch. Gradients "
-        f"are held against one-sided differences where the solution is unique. {left_out}".strip(),
+        f"Wrong answers: {wrong or 'none'}. wrong: claims to have solved what is not, or an answer depends on its "
+        "neighbours in the batch although it is unique (peers are held to 1e-6, and to part (a) of our residual "
+        "alone). inexact: more than the case's tolerance from the known solution. gives up: says that it failed where "
+        "there is a solution, or lacks the proof that there is none. batch: answers that move by more than 1e-12 when "
+        "copies and an infeasible problem join the batch. Gradients are held against one-sided differences where the "
+        f"solution is unique. {left_out}".strip(),
         table=Table(
             ("method", "cases", *VERDICTS, "batch", "residual / allowed", "gradients", "median error", "worst error"),
             [_method_row(method, cases, counts) for method in methods],
