@@ -825,9 +825,12 @@ def _prepare_lemke(stage, single_precision, cover):
 
 @_jit_inline
 def _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
-    """Put a scaled solution into the caller's arrays, with exact zeros, also where w is rounding noise."""
+    """Put a scaled solution into the caller's arrays, with exact zeros, also where w is rounding noise.
+
+    Denormal numbers are noise too: S z has lost them, while M z would not.
+    """
     for i in range(z.size):
-        z_out[i] = c[i] * s * z[i] if basis[i] else 0.0
+        z_out[i] = c[i] * s * z[i] if basis[i] and z[i] >= TINY else 0.0
         w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s / r[i]
         basis_out[i] = basis[i] != 0
 

@@ -138,6 +138,14 @@ def test_published_cases_are_solved_or_recognised_as_unsolvable():
         check_contract(M[None], q[None], result)
 
 
+def test_noise_that_only_the_original_data_would_show_is_no_part_of_a_solution():
+    """Found by `benchmark fuzz`: z_2 = 4e-25, one denormal in units of q, made the third row negative."""
+    M = [[7.301955453740253, 0.39984287818552694, 0.0], [0.39984287818552694, 8.481759852506906, 1.0], [0.0, -1.0, 0.0]]
+    result = solve(M, [-0.79401177669975, -1e300, 0.0])
+    assert result.status[0] == Status.SOLVED
+    assert result.z[0, 1] == 0
+
+
 def test_published_cases_that_are_solvable_are_solved_when_their_data_are_rounded_to_float32():
     cases = _published_cases()
     if cases is None:
