@@ -442,7 +442,7 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
         rows = max(rows, abs(min(c[i] * z[i] / z_size if z[i] > 0.0 else 0.0, w_share)))
         absMz = max(absMz, (omega[i] - abs(p[i])) / r[i])
         absq = max(absq, abs(q[i]))
-        lost = lost or (abs(p[i]) < TINY and q[i] != 0.0 and s > 2.0 * TINY)
+        lost = lost or (abs(p[i]) < TINY and abs(q[i]) >= (0.0 if s > 2.0 * TINY else TINY) and q[i] != 0.0)
         total += abs(w[i]) * s / r[i] + c[i] * s * z[i]
     residual = max(natural / q_size, rows)
     if noise > 1e-6 * q_size:
@@ -825,14 +825,19 @@ def _prepare_lemke(stage, single_precision, cover):
 
 @_jit_inline
 def _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
-    """Put a scaled solution into the caller's arrays, with exact zeros, also where w is rounding noise.
+    """Put a scaled solution into the caller's arrays; whether the range of doubles holds it.
 
-    Denormal numbers are noise too: S z has lost them, while M z would not.
+    With exact zeros, also where w is rounding noise. Denormal numbers are noise too: S z has lost them, while M z would
+    not.
     """
+    lost = 0
     for i in range(z.size):
-        z_out[i] = c[i] * s * z[i] if basis[i] and z[i] >= TINY else 0.0
+        holds = basis[i] and z[i] >= TINY
+        z_out[i] = c[i] * s * z[i] if holds else 0.0
         w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s / r[i]
         basis_out[i] = basis[i] != 0
+        lost += not (z_out[i] <= LARGEST and w_out[i] <= LARGEST) or (holds and z_out[i] == 0.0)
+    return lost == 0
 
 
 @_jit_inline
@@ -891,8 +896,8 @@ def _solve_one(
             _evaluate(S, p, z, w, omega)
             residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
         if residual < best and (residual <= limit or not accepted):
-            _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
-            best, accepted = residual, residual <= limit and _all_finite(z_out) and _all_finite(w_out)
+            in_range = _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
+            best, accepted = residual, residual <= limit and in_range
         if ended == STUCK and not asked and not accepted:
             asked = True
             if _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, 20 * n + 50):

@@ -146,6 +146,12 @@ def test_noise_that_only_the_original_data_would_show_is_no_part_of_a_solution()
     assert result.z[0, 1] == 0
 
 
+def test_a_solution_below_the_range_of_doubles_is_not_solved():
+    """Found by `benchmark fuzz`: z = 4e-607 was returned as 0, which leaves w = q < 0."""
+    result = solve([[1e300]], [-4e-307])
+    assert result.status[0] == Status.UNSOLVED
+
+
 def test_published_cases_that_are_solvable_are_solved_when_their_data_are_rounded_to_float32():
     cases = _published_cases()
     if cases is None:
