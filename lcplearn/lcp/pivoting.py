@@ -373,19 +373,24 @@ def _equilibrate(M, size, largest, d):
 
 
 @_jit
-def _rescale(M, r, c):
-    """Improve r and c by Ruiz sweeps of rows and columns apart: not a congruence, but it keeps solutions and P."""
+def _rescale(M, r, c, largest):
+    """Improve r and c by scaling rows and columns apart: not a congruence, but it keeps solutions and P."""
     n = r.size
-    for _ in range(2 * RUIZ_SWEEPS):
-        for side in range(2):
-            for i in range(n):
-                largest = 0.0
-                for j in range(n):
-                    largest = max(largest, abs(M[i, j] * c[j]) * r[i] if side == 0 else abs(r[j] * M[j, i]) * c[i])
-                if largest > 0.0 and side == 0:
-                    r[i] /= largest
-                elif largest > 0.0:
-                    c[i] /= largest
+    for _ in range(RUIZ_SWEEPS):
+        for i in range(n):
+            size = 0.0
+            for j in range(n):
+                scaled = abs(M[i, j]) * c[j]
+                size = scaled if scaled > size else size
+            r[i] = 1.0 / max(size, TINY) if size > 0.0 else r[i]
+        for j in range(n):
+            largest[j] = 0.0
+        for i in range(n):
+            for j in range(n):
+                scaled = abs(M[i, j]) * r[i]
+                largest[j] = scaled if scaled > largest[j] else largest[j]
+        for j in range(n):
+            c[j] = 1.0 / max(largest[j], TINY) if largest[j] > 0.0 else c[j]
 
 
 @_jit
@@ -863,7 +868,7 @@ def _solve_one(
             capped = True
             break
         if stage == 3:
-            _rescale(M, r, c)
+            _rescale(M, r, c, x)
             s = _scale(M, q, r, c, S, p)
             for i in range(n):
                 basis[i] = p[i] < 0.0
