@@ -185,7 +185,7 @@ def _check_solvable(batch: Batch, solution: LCPSolution) -> list[Finding]:
 
 
 def _check_gradient(name: str, M: torch.Tensor, q: torch.Tensor, **options: Any) -> list[Finding]:
-    """Gradients are finite, unless that of M, grad_q z', overflows, and zero where unsolved."""
+    """Gradients are finite, unless true ones (grad_q z', or z / w with smoothing) overflow, and zero where unsolved."""
     M, q = M.clone().requires_grad_(), q.clone().requires_grad_()
     solution = solve_lcp(M, q, **options)
     loss = torch.where(solution.solved, (solution.z + solution.w).sum(-1), 0.0).sum()
@@ -198,8 +198,10 @@ def _check_gradient(name: str, M: torch.Tensor, q: torch.Tensor, **options: Any)
     for of, gradient in zip("Mq", gradients, strict=False):
         flat = gradient.reshape(len(q), -1)
         for b in torch.nonzero(~flat.isfinite().all(1)).flatten().tolist():
-            product = gradients[1][b].abs().max().log() + solution.z[b].abs().max().log()
-            overflows = of == "M" and bool(product > np.log(torch.finfo(M.dtype).max))
+            z, w, limit = solution.z[b].detach().double(), solution.w[b].detach().double(), torch.finfo(M.dtype).max
+            steepest = float((z / w).max()) if options.get("smoothing") else float(gradients[1][b].abs().max())
+            true = np.log(steepest) + (float(z.max().log()) if of == "M" else 0.0)  # the gradient's size
+            overflows = np.isfinite(steepest) and true > np.log(limit)
             if _within(M[b].detach().numpy(), q[b].detach().numpy(), huge) and not overflows:
                 findings.append(Finding(f"{name}: gradient not finite", f"with respect to {of}", [b]))
         for b in torch.nonzero((flat != 0).any(1) & ~solution.solved).flatten().tolist():
