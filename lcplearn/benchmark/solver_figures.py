@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHOWN = ("F1", "F3 polygon n=8", "F4 cube", "F5 positive definite n=50", "F7 nonsymmetric P n=50", "badly scaled")
+SHOWN = ("F1", "F3 polygon n=8", "F4 cube", "F4 stacked cubes n=48 ratio 1e3", "F7 nonsymmetric P n=50", "row and")
 FLOOR = 1e-17  # an exact result has no place on a logarithmic axis
 
 
@@ -21,14 +21,14 @@ def draw_work_precision(rows: Sequence[Row]) -> "Figure":
     figure, axes = _panels(rows)
     for ax, family in axes:
         for row in (row for row in rows if row["family"] == family):
-            time, residual = float(row["forward_us"]), max(float(row["worst_residual"]), FLOOR)
+            time, residual = float(row["forward_cpu_us"]), max(float(row["worst_residual"]), FLOOR)
             look = style(str(row["method"]))
-            spread = [[time - float(row["forward_low_us"])], [float(row["forward_high_us"]) - time]]
+            spread = [[time - float(row["forward_cpu_low_us"])], [float(row["forward_cpu_high_us"]) - time]]
             ax.errorbar(residual, time, yerr=spread, **{**look, "linestyle": ""}, label=_base(row),
                         fillstyle="full" if float(row["solved"]) >= 0.99 else "none", capsize=2)  # fmt: skip
         ax.axvline(1e-10, color="0.6", linewidth=0.8, linestyle=":")
         _finish(ax, family)
-    _labels(figure, "worst residual [-]", "time of a problem [µs]")
+    _labels(figure, "worst residual [-]", "CPU time of a problem [µs]")
     return figure
 
 
@@ -39,9 +39,9 @@ def draw_gradients(rows: Sequence[Row]) -> "Figure":
         for row in (row for row in rows if row["family"] == family):
             error = max(float(row["gradient_error"]), FLOOR)
             look = {**style(str(row["method"])), "linestyle": ""}
-            ax.plot(error, float(row["backward_us"]), **look, label=_base(row))
+            ax.plot(error, float(row["backward_cpu_us"]), **look, label=_base(row))
         _finish(ax, family)
-    _labels(figure, "median relative error of a slope [-]", "backward pass of a problem [µs]")
+    _labels(figure, "median relative error of a slope [-]", "backward, CPU time of a problem [µs]")
     return figure
 
 
@@ -55,7 +55,7 @@ def draw_growth(rows: Sequence[Row], batch: int) -> "Figure":
     grown = [row for row in double if str(row["family"]).startswith("F5") and row["batch"] == batch]
     _lines(axes[0, 2], grown, "n")
     axes[0, 2].set(xscale="log", yscale="log", xlabel="n [-]", title=f"F5 positive definite, batch {batch}")
-    axes[0, 0].set_ylabel("time of a problem [µs]")
+    axes[0, 0].set_ylabel("CPU time of a problem [µs]")
     one_legend(figure, axes, columns=3)
     return figure
 
@@ -64,7 +64,7 @@ def _lines(ax: "Axes", rows: Sequence[Row], x: str) -> None:
     for name in dict.fromkeys(str(row["method"]) for row in rows):
         if name in ("smoothed 1e-4", "smoothed 1e-10"):
             continue  # as smoothed 1e-7
-        points = sorted((float(row[x]), float(row["forward_us"])) for row in rows if row["method"] == name)
+        points = sorted((float(row[x]), float(row["forward_cpu_us"])) for row in rows if row["method"] == name)
         ax.plot(*zip(*points, strict=True), **style(name), label=name.split(" ")[0], markersize=4)
 
 

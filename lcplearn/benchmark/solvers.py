@@ -4,6 +4,7 @@ Every method and installed peer on every family, batch 1 to 10,000, float64 and 
 """
 
 import re
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -30,14 +31,16 @@ from lcplearn.lcp.residuals import default_tolerance
 Family = Callable[[np.random.Generator, int], Problems]
 KEY = ("family", "batch", "precision")
 COLUMNS = (
-    "method", "n", "forward_us", "forward_low_us", "forward_high_us", "forward_cpu_us", "backward_us",
-    "backward_cpu_us", "residual", "worst_residual", "solved", "gradient_error",
-    "worst_gradient_error", "peak_mb",
+    "method", "n", "forward_us", "forward_cpu_us", "forward_cpu_low_us", "forward_cpu_high_us", "backward_us",
+    "backward_cpu_us", "residual", "worst_residual", "solved", "gradient_error", "worst_gradient_error", "gradients",
+    "references", "peak_mb",
 )  # fmt: skip
 BATCHES, QUICK_BATCHES = (1, 10, 100, 1000, 10_000), (1, 100)
 QUICK_FAMILIES = ("F1 sliding block direct n=2", "F3 polygon n=8", "F4 cube n=24", "F5 positive definite n=10")
 LARGEST = 256e6  # bytes of M
-LONGEST, LONGEST_QUICK = 4.0, 0.5  # seconds of one call; a method that needs more is left out at that batch
+LONGEST, LONGEST_QUICK = 1.0, 0.5  # seconds of one call; a method that needs more is left out at that batch
+FEW, SOME = 8, 64  # problems whose time tells how long a batch will take
+COMPILATION = 30.0  # seconds that a peer's first call may take besides
 GRADIENTS = 100  # problems whose gradients are checked
 
 
@@ -105,20 +108,20 @@ def measure(family: str, data: Problems, dtype: torch.dtype, options: Options) -
     truth = reference(family, checked, options.seed) if count >= 10 else None
     rows: list[Row] = []
     for name, z in calls.z.items():
-        time = forward[name]
+        timing = forward[name]
         row: Row = {
             "method": name,
             "n": data.q.shape[-1],
-            "forward_us": 1e6 * time.wall / count,
-            "forward_low_us": 1e6 * time.low / count,
-            "forward_high_us": 1e6 * time.high / count,
-            "forward_cpu_us": 1e6 * time.cpu / count,
+            "forward_us": 1e6 * timing.wall / count,
+            "forward_cpu_us": 1e6 * timing.cpu / count,
+            "forward_cpu_low_us": 1e6 * float(np.quantile(timing.cpu_samples, 0.25)) / count,
+            "forward_cpu_high_us": 1e6 * float(np.quantile(timing.cpu_samples, 0.75)) / count,
             "peak_mb": peak_memory(calls.forward[name]) / 1e6,
             **_residuals(data, z, default_tolerance(dtype)),
         }
         if name in backward:
-            time = backward[name]
-            row |= {"backward_us": 1e6 * time.wall / count, "backward_cpu_us": 1e6 * time.cpu / count}
+            timing = backward[name]
+            row |= {"backward_us": 1e6 * timing.wall / count, "backward_cpu_us": 1e6 * timing.cpu / count}
             row |= _gradient_columns(checked, truth, dtype, METHODS[name])
         rows.append(row)
     return rows
@@ -130,8 +133,11 @@ def _calls(data: Problems, dtype: torch.dtype, longest: float) -> Calls:
     M, q = torch.from_numpy(data.M).to(dtype), torch.from_numpy(data.q).to(dtype)
     diagonal = bool((data.M * np.eye(data.M.shape[-1]) == data.M).all())
     for name, keywords in METHODS.items():
-        few = partial(solve_lcp, M[:8], q[:8], **keywords)
-        if (name == "diagonal" and not diagonal) or _seconds(few) * max(len(q) / 8, 1) > longest:
+        if name == "diagonal" and not diagonal:
+            continue
+        few, some = (partial(solve_lcp, M[:count], q[:count], **keywords) for count in (FEW, SOME))
+        fixed, more = _seconds(few), _seconds(some)
+        if more + max(more - fixed, 0.0) / (SOME - FEW) * max(len(q) - SOME, 0) > longest:
             continue
         calls.forward[name] = partial(solve_lcp, M, q, **keywords)
         calls.forward[name]()
@@ -141,8 +147,11 @@ def _calls(data: Problems, dtype: torch.dtype, longest: float) -> Calls:
         calls.backward[name] = partial(torch.autograd.grad, z, leaves, torch.ones_like(z), retain_graph=True)
         calls.backward[name]()
     for name, peer in peers().items():
-        calls.forward[name] = partial(peer, data.M, data.q)
-        calls.z[name] = torch.from_numpy(calls.forward[name]().z)
+        call = partial(peer, data.M, data.q)
+        began = time.perf_counter()
+        answer = call()
+        if time.perf_counter() - began < longest + COMPILATION:  # a peer may cycle for minutes
+            calls.forward[name], calls.z[name] = call, torch.from_numpy(answer.z)
     return calls
 
 
@@ -168,10 +177,13 @@ def _seconds(call: Callable[[], Any]) -> float:
 def _gradient_columns(
     data: Problems, truth: Reference | None, dtype: torch.dtype, keywords: dict[str, Any]
 ) -> dict[str, float]:
-    errors = gradient_errors(data, truth, dtype, **keywords) if truth else np.empty(0)
-    if not len(errors):
+    if truth is None:
         return {}
-    return {"gradient_error": float(np.median(errors)), "worst_gradient_error": float(errors.max())}
+    errors = gradient_errors(data, truth, dtype, **keywords)
+    counts: dict[str, float] = {"gradients": len(errors), "references": int(truth.trusted.sum())}
+    if not len(errors):
+        return counts
+    return {**counts, "gradient_error": float(np.median(errors)), "worst_gradient_error": float(errors.max())}
 
 
 def _say(study: Study, batch: int) -> None:
@@ -181,19 +193,21 @@ def _say(study: Study, batch: int) -> None:
     study.say(
         "Which solver is fastest for the accuracy I need?",
         f"{_speed(double)} Residuals max |min(z, w)| / (1 + max |q|) are recomputed from the data; bars are quartiles "
-        f"over repeats; time of a problem in a batch of {batch}. Hollow: fewer than 99 % of the problems solved.",
+        f"over repeats; CPU time of a problem in a batch of {batch}. Hollow: fewer than 99 % of the problems solved. "
+        f"Left out, as a call takes more than {LONGEST:g} s: {_left_out(study.rows)}.",
         figure=draw_work_precision(double),
     )
     with_gradient = [row for row in double if isinstance(row["gradient_error"], float)]
     study.say(
         "Which gradient can I trust, and what does it cost?",
         f"{_gradients(with_gradient)} The error is that of the slope of a unique quantity (velocity, or z of a "
-        "P-matrix) along a line of problems.",
+        "P-matrix) along a line of problems, where a method solves and ends in the solution of the reference: friction "
+        "with large mu has several.",
         figure=draw_gradients(with_gradient),
     )
     study.say(
         "How does time grow with batch and size?",
-        "Slope of the logarithm of wall time of a call against that of batch size (from batch 100, where the fixed "
+        "Slope of the logarithm of CPU time of a call against that of batch size (from batch 100, where the fixed "
         "cost of a call no longer shows), and of the time of a problem against n.",
         table=_growth(study.rows, batch),
         figure=draw_growth(study.rows, batch),
@@ -201,8 +215,8 @@ def _say(study: Study, batch: int) -> None:
     for precision in ("float64", "float32"):
         rows = [row for row in at_batch if row["precision"] == precision]
         columns = (
-            "family", "method", "forward_us", "forward_cpu_us", "backward_us", "residual", "worst_residual", "solved",
-            "gradient_error", "worst_gradient_error", "peak_mb",
+            "family", "method", "forward_us", "forward_cpu_us", "backward_cpu_us", "residual", "worst_residual",
+            "solved", "gradients", "references", "gradient_error", "worst_gradient_error", "peak_mb",
         )  # fmt: skip
         table = Table([c.replace("_", " ") for c in columns], [[row[c] for c in columns] for row in rows])
         study.say(f"All methods at batch {batch}, {precision}", missing_peers(), table=table)
@@ -233,8 +247,19 @@ def _gradients(rows: list[Row]) -> str:
     parts = []
     for name in dict.fromkeys(str(row["method"]) for row in rows):
         errors = [float(row["gradient_error"]) for row in rows if row["method"] == name]
-        parts.append(f"{name} {np.median(errors):.1g} (worst family {max(errors):.1g})")
+        compared, references = (sum(float(row[c]) for row in rows if row["method"] == name)
+                                for c in ("gradients", "references"))  # fmt: skip
+        share = f"{compared / references:.0%} compared" if references else "none compared"
+        parts.append(f"{name} {np.median(errors):.1g} (worst family {max(errors):.1g}; {share})")
     return "Median relative error: " + "; ".join(parts) + "."
+
+
+def _left_out(rows: list[Row]) -> str:
+    """How often each method was too slow for a family and batch."""
+    measured = {(row["family"], row["batch"], row["precision"]) for row in rows}
+    found = Counter(str(row["method"]) for row in rows)
+    names = [name for name in (*METHODS, *peers()) if name != "diagonal" and found[name] < len(measured)]
+    return ", ".join(f"{name} in {len(measured) - found[name]} of {len(measured)} batches" for name in names) or "none"
 
 
 def _growth(rows: list[Row], batch: int) -> Table:
@@ -245,12 +270,12 @@ def _growth(rows: list[Row], batch: int) -> Table:
         own = [row for row in double if row["method"] == name]
         in_batch = []
         for family in dict.fromkeys(row["family"] for row in own):
-            points = [(float(r["batch"]), float(r["batch"]) * float(r["forward_us"])) for r in own
+            points = [(float(r["batch"]), float(r["batch"]) * float(r["forward_cpu_us"])) for r in own
                       if r["family"] == family and float(r["batch"]) >= 100]  # fmt: skip
             in_batch.append(exponent(*zip(*points, strict=True)) if len(points) > 1 else np.nan)
         in_n = []
         for prefix in ("F5", "F7", "F4 stacked"):
-            points = [(float(r["n"]), float(r["forward_us"])) for r in own
+            points = [(float(r["n"]), float(r["forward_cpu_us"])) for r in own
                       if str(r["family"]).startswith(prefix) and "ratio" not in str(r["family"])
                       and r["batch"] == batch and float(r["n"]) >= 10]  # fmt: skip
             in_n.append(exponent(*zip(*points, strict=True)) if len(points) > 1 else np.nan)
