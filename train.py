@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 DEBUGGING = os.environ.get("HYDRA_FULL_ERROR") == "1"
-PROCESSES = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1  # torchrun's
+PROCESSES = int(os.environ.get("WORLD_SIZE", 1)) if "TORCHELASTIC_RUN_ID" in os.environ else 1  # torchrun's
 MISTAKES = (HydraException, OmegaConfBaseException, ValueError, OSError)
 CONF = Path(__file__).parent / "conf"
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from lcplearn.lcp.methods import Options, pivoting_kernel, pivots, plain, solve, traced
-from lcplearn.lcp.residuals import two_sided_scales
+from lcplearn.lcp.residuals import multiply, two_sided_scales
 from lcplearn.lcp.solution import LCPSolution, Status
 
 # By precision of the data: pivots below the first (times n) call a block singular, singular values below the second
@@ -124,6 +124,7 @@ def adjoint(
     `saved` holds M, z, w, basis and status.
     """
     M, z, w, basis, status = saved
+    basis, status = basis.bool(), status.long()  # hooks on saved tensors may give back others
     if pivots(z, options) and not _differentiated(grad_z, grad_w):
         return _adjoint_in_kernel(M, z, basis, status, grad_z, grad_w, need_M)
     grad_z = torch.zeros_like(z) if grad_z is None else grad_z
@@ -135,7 +136,7 @@ def adjoint(
     if options.smoothing:
         basis, damping = _damping(z, w, basis & solved)
     h_I = torch.where(basis, 0.0, g_w)
-    rhs = -g_z - (M.mT @ h_I.unsqueeze(-1)).squeeze(-1)
+    rhs = -g_z - multiply(M.mT, h_I)
     K = M.mT
     if options.smoothing:
         K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
@@ -168,8 +169,8 @@ def _adjoint_in_kernel(
     grad_M, grad_q = kernel.solve_adjoint(
         plain(M),
         plain(z),
-        basis.bool().contiguous(),  # what hooks on saved tensors give back may have another type and layout
-        status.long().contiguous(),
+        basis.contiguous(),
+        status.contiguous(),
         None if grad_z is None else plain(grad_z),
         None if grad_w is None else plain(grad_w),
         need_M,
@@ -189,13 +190,13 @@ def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, opt
     z = torch.where(solved, z, 0.0)
     e = torch.zeros_like(z) if dq is None else torch.where(solved, dq.double(), 0.0)
     if dM is not None:
-        e = e + torch.where(solved, (dM.double() @ z.unsqueeze(-1)).squeeze(-1), 0.0)
+        e = e + torch.where(solved, multiply(dM.double(), z), 0.0)
     K = M
     if options.smoothing:
         basis, damping = _damping(z, w, basis & solved)
         K = M + torch.diag_embed(damping)
     dz = _solve_on_basis(K, basis & solved, -e, dtype)
-    dw = e + (M @ dz.unsqueeze(-1)).squeeze(-1)
+    dw = e + multiply(M, dz)
     if not options.smoothing:
         dw = torch.where(basis, 0.0, dw)
     return dz.to(dtype), torch.where(solved, dw, 0.0).to(dtype)
@@ -237,7 +238,7 @@ class _BasisSolve(torch.autograd.Function):
     def jvp(ctx: Any, dK: Tensor | None, _: Any, drhs: Tensor | None, *__: Any) -> Tensor:
         K, basis, x = ctx.saved_tensors
         e = torch.zeros_like(x) if drhs is None else drhs
-        e = e if dK is None else e - (dK @ x.unsqueeze(-1)).squeeze(-1)
+        e = e if dK is None else e - multiply(dK, x)
         return _BasisSolve.apply(K, basis, e, ctx.rank_tolerances)
 
     @staticmethod

@@ -29,7 +29,7 @@ class Options(NamedTuple):
 
 
 def traced() -> bool:
-    """Whether a tracer records what is done (compile, export, make_fx), or tensors are fake: numba can't be traced.
+    """Whether a tracer records what is done (compile, export, make_fx) or makes fake tensors: numba can't be traced.
 
     Other modes of torch's dispatcher only watch.
     """

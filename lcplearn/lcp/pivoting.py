@@ -374,23 +374,22 @@ def _equilibrate(M, size, largest, d):
 
 @_jit
 def _rescale(M, r, c, largest):
-    """Improve r and c by scaling rows and columns apart: not a congruence, but it keeps solutions and P."""
+    """Scale rows and columns apart, to largest entries of 1: not a congruence, but it keeps solutions and P."""
     n = r.size
-    for _ in range(RUIZ_SWEEPS):
-        for i in range(n):
-            size = 0.0
-            for j in range(n):
-                scaled = abs(M[i, j]) * c[j]
-                size = scaled if scaled > size else size
-            r[i] = 1.0 / max(size, TINY) if size > 0.0 else r[i]
+    for i in range(n):
+        size = 0.0
         for j in range(n):
-            largest[j] = 0.0
-        for i in range(n):
-            for j in range(n):
-                scaled = abs(M[i, j]) * r[i]
-                largest[j] = scaled if scaled > largest[j] else largest[j]
+            scaled = abs(M[i, j]) * c[j]
+            size = scaled if scaled > size else size
+        r[i] = 1.0 / max(size, TINY) if size > 0.0 else r[i]
+    for j in range(n):
+        largest[j] = 0.0
+    for i in range(n):
         for j in range(n):
-            c[j] = 1.0 / max(largest[j], TINY) if largest[j] > 0.0 else c[j]
+            scaled = abs(M[i, j]) * r[i]
+            largest[j] = scaled if scaled > largest[j] else largest[j]
+    for j in range(n):
+        c[j] = 1.0 / max(largest[j], TINY) if largest[j] > 0.0 else c[j]
 
 
 @_jit
@@ -434,7 +433,8 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
     """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
     n = q.size
     smallest = TINY / s if s < 1e-150 else 0.0  # not a denormal, with which arithmetic is slow
-    z_size, q_size, natural, noise, rows, absMz, absq, total = smallest, smallest, 0.0, 0.0, 0.0, 0.0, TINY, 0.0
+    z_size, q_size, natural, noise, rows, absMz, total = smallest, smallest, 0.0, 0.0, 0.0, 0.0, 0.0
+    unseen = TINY if s <= 2.0 * TINY else 5e-324  # sizes below TINY count as TINY where all are: then s is TINY's size
     lost = False  # q spans more than the range of doubles: its small rows are not in p, and nobody has solved them
     for i in range(n):
         z_size = max(z_size, c[i] * z[i])
@@ -445,16 +445,15 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
         q_size = max(q_size, f * abs(p[i]))
         w_share = w[i] / max(omega[i], smallest * r[i]) if w[i] != 0.0 else 0.0
         rows = max(rows, abs(min(c[i] * z[i] / z_size if z[i] > 0.0 else 0.0, w_share)))
-        absMz = max(absMz, (omega[i] - abs(p[i])) / r[i])
-        absq = max(absq, abs(q[i]))
-        lost = lost or (abs(p[i]) < TINY and abs(q[i]) >= (0.0 if s > 2.0 * TINY else TINY) and q[i] != 0.0)
+        absMz = max(absMz, f * (omega[i] - abs(p[i])))
+        lost = lost or (abs(p[i]) < TINY and abs(q[i]) >= unseen)
         total += abs(w[i]) * s / r[i] + c[i] * s * z[i]
     residual = max(natural / q_size, rows)
     if noise > 1e-6 * q_size:
         residual = max(residual, noise / q_size)
     if lost or not total <= LARGEST:
         residual = np.inf
-    return residual, max(tol, min(1e-6, 10.0 * EPS * absMz * s / absq))
+    return residual, max(tol, min(1e-6, 10.0 * EPS * absMz / q_size))
 
 
 @_jit
@@ -830,19 +829,19 @@ def _prepare_lemke(stage, single_precision, cover):
 
 @_jit_inline
 def _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
-    """Put a scaled solution into the caller's arrays; whether the range of doubles holds it.
+    """Put a scaled solution into the caller's arrays, with exact zeros; whether these hold it to full precision.
 
-    With exact zeros, also where w is rounding noise. Denormal numbers are noise too: S z has lost them, while M z would
-    not.
+    Where w is rounding noise it is zero too, and so are denormal z: S z has lost them, while M z would not.
     """
-    lost = 0
+    smallest = TINY if s > 4.0 * TINY else 5e-324  # data that are all denormal may have a denormal solution
+    outside = 0
     for i in range(z.size):
         holds = basis[i] and z[i] >= TINY
         z_out[i] = c[i] * s * z[i] if holds else 0.0
         w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s / r[i]
         basis_out[i] = basis[i] != 0
-        lost += not (z_out[i] <= LARGEST and w_out[i] <= LARGEST) or (holds and z_out[i] == 0.0)
-    return lost == 0
+        outside += not (z_out[i] <= LARGEST and w_out[i] <= LARGEST) or (holds and z_out[i] < smallest)
+    return outside == 0
 
 
 @_jit_inline
@@ -900,9 +899,10 @@ def _solve_one(
         if residual > limit and _drop_noise(z, w, omega, S, tol):
             _evaluate(S, p, z, w, omega)
             residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
-        if residual < best and (residual <= limit or not accepted):
-            in_range = _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
-            best, accepted = residual, residual <= limit and in_range
+        good = residual <= limit
+        if (good and not accepted) or (residual < best and (good or not accepted)):
+            holds = _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
+            best, accepted = residual if holds else np.inf, good and holds
         if ended == STUCK and not asked and not accepted:
             asked = True
             if _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, 20 * n + 50):

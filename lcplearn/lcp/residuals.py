@@ -6,9 +6,10 @@ With w = M z + q, the residual of z is the larger of two, where 0/0 counts as 0:
     symmetric Ruiz scaling of M, so that D M D has entries of size 1;
 (b) max_i |min(z_i / max_j |z_j|, w_i / omega_i)| with omega_i = |q_i| + sum_j |M_ij| |z_j|.
 
-Both are unchanged under z -> b/a z for (a M, b q), (a) also under congruence. Neither alone will do: (a) does not see
-tiny decoupled rows, (b) accepts z = t (1, 1) with large t for M = [[1, -1], [-1, 1]], q = -1. Sizes below 2.2e-308
-count as 2.2e-308, since smaller doubles have no precision.
+Both are unchanged under z -> b/a z for (a M, b q), (a) also under a congruence after which the scaling finds the same
+D M D (it stops as soon as entries are of size 1, so not always: NOTES.md, section 1). Neither alone will do: (a) does
+not see tiny decoupled rows, (b) accepts z = t (1, 1) with large t for M = [[1, -1], [-1, 1]], q = -1. Sizes below
+2.2e-308 count as 2.2e-308, since smaller doubles have no precision.
 
 (c) A w that is rounding noise verifies nothing: rows with |w_i| <= 8 eps omega_i count with eps d_i omega_i / max |q~|
 where that is above 1e-6. M = [[2, -2], [1, -1]], q = (-2, -2) has no solution, but with z = 1e18 (1, 1) the sum
@@ -43,7 +44,7 @@ def default_tolerance(dtype: torch.dtype) -> float:
     return 2e-6 if dtype == torch.float32 else 1e-10
 
 
-def multiply(M: Float[Tensor, "*batch n n"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+def multiply(M: Float[Tensor, "*#batch n n"], x: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch n"]:
     """M x, summed in an order that does not depend on the batch, unlike `@`.
 
     An element's rounding must not depend on its neighbours: it chooses between the solutions where there are several.
@@ -98,8 +99,8 @@ def judge(
 ) -> Judgement:
     """Residual of z and what it is held against, for float64 data.
 
-    The tolerance is `tol`, raised only to what rounding of M z + q allows: 10 eps max(|M| z) / max |q|, at most 1e-6.
-    A non-finite z has residual infinity.
+    The tolerance is `tol`, raised only to what rounding of M z + q allows: 10 eps max(D |M| z) / max |q~|, and at most
+    to 1e-6. A non-finite z has residual infinity.
     """
     if M.shape[-1] == 0:
         zero = torch.zeros(q.shape[:-1], dtype=q.dtype, device=q.device)
@@ -117,5 +118,5 @@ def judge(
     noise = torch.where(w.abs() <= 8 * EPS * omega, EPS * d * omega, 0.0).amax(-1) / q_size
     residual = torch.where(noise > 1e-6, torch.maximum(residual, noise), residual)
     residual = torch.where(residual.isfinite(), residual, torch.inf)
-    rounding = 10 * EPS * absMz.amax(-1) / q.abs().amax(-1).clamp_min(TINY)
+    rounding = 10 * EPS * (d * absMz).amax(-1) / q_size
     return Judgement(residual, rounding.clamp(max=1e-6).clamp(min=tol))

@@ -73,7 +73,9 @@ def check_torchrun(arguments: Sequence[str]) -> None:
     """
     if not {"-m", "--multirun"}.isdisjoint(arguments):
         raise SettingsError("torchrun trains one run: sweep (-m) without it, with trainer.strategy=ddp_fork.")
-    if not any(argument.startswith("hydra.run.dir=") for argument in arguments):
+    if not {"--help", "--cfg", "-c", "--hydra-help"}.isdisjoint(arguments):
+        return
+    if not any(argument.lstrip("+").startswith("hydra.run.dir=") for argument in arguments):
         raise SettingsError("torchrun's processes need one folder: add hydra.run.dir=runs/NAME.")
 
 

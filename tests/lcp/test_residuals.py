@@ -104,3 +104,9 @@ def test_without_a_central_path_smoothing_is_never_solved():
         assert not solution.solved
         solution.z.sum().backward()
         assert not M.grad.any()
+
+
+def test_one_row_in_large_units_does_not_loosen_the_tolerance_of_the_others():
+    M, q, z = np.diag([1e30, 1.0]), np.array([-1e-15, -1.0]), np.array([1e-22, 1.0])
+    for residual, tolerance in (judged_by_kernel(M, q, z), judged_by_torch(M, q, z)):
+        assert residual > tolerance == pytest.approx(1e-10)
