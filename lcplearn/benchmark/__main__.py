@@ -7,7 +7,7 @@ stopped continues where it was when the same command is given again.
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--quick", action="store_true", help="small sizes, less than a minute")
         _add_threads_and_seed(command)
     fuzz = commands.add_parser("fuzz", help="hunt for wrong statuses, NaN, crashes and batch dependence")
-    fuzz.add_argument("--minutes", type=float, default=1.0, help="how long to hunt (default: 1)")
+    fuzz.add_argument("--minutes", type=_at_least(1), default=1, help="how long to hunt (default: 1)")
     fuzz.add_argument("--output", type=Path, default=Path("runs/benchmark/fuzz"), metavar="DIR", help="for findings")
     fuzz.add_argument("--replay", type=Path, metavar="FILE", help="check one finding again, instead of hunting")
     _add_threads_and_seed(fuzz)
@@ -80,8 +80,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_threads_and_seed(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--threads", type=int, default=1, metavar="N", help="of torch and BLAS (default: 1)")
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="of the generated problems (default: 0)")
+    command.add_argument("--threads", type=_at_least(1), default=1, metavar="N", help="of torch and BLAS (default: 1)")
+    command.add_argument("--seed", type=_at_least(0), default=0, metavar="N", help="of what is generated (default: 0)")
+
+
+def _at_least(smallest: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        if not text.isdecimal() or int(text) < smallest:
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {smallest}; got {text!r}")
+        return int(text)
+
+    return parse
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
 STYLES: dict[str, Style] = {
     # solvers
     "pivoting": Style(BLUE, "o"),
-    "pivoting, initial basis": Style(BLUE, "o", "--"),
     "interior_point": Style(ORANGE, "s"),
     "smoothed": Style(PINK, "D", "-."),
     "diagonal": Style(GREEN, "^"),
@@ -42,11 +41,6 @@ STYLES: dict[str, Style] = {
     "psd_skew": Style(YELLOW, "p", "-."),
     "structured": Style(GREEN, "^"),
     "physical": Style(GREEN, "*", "--"),
-    "markov": Style("#888888", "d", "-"),
-    # rows of a scene's LCP
-    "full": Style(RED, "s"),
-    "minimal": Style(BLUE, "o"),
-    "truth": Style(BLACK, "", "-"),
 }
 
 

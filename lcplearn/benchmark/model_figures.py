@@ -140,7 +140,8 @@ def real_beside_simulated(slides: Sequence[Row], simulated: Sequence[Row]) -> "F
                 dots = look(name) | {"linestyle": "none"}
                 ax.errorbar([middle], [at], xerr=[[middle - low], [high - middle]], markersize=7, **dots)
         ax.set_ylim(len(names) - 0.5, -0.5)
-        _decades(ax, [float(row[column]) for row in rows if row["model"] in names])
+        if ax is right:
+            _decades(ax, [float(row[column]) for row in rows if row["model"] in names])
     at_rest = [median([row for row in learned_from if row["model"] == name], "rest_share") for name in names]
     labels = [f"{name}\n{share:.0%} at rest" for name, share in zip(names, at_rest, strict=True)]
     left.set_yticks(range(len(names)), labels, fontsize=9)

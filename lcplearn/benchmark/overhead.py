@@ -1,7 +1,6 @@
 """`benchmark overhead`: what a call costs beside the solve: one problem a call, backward against forward, memory."""
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -159,8 +158,3 @@ def _say(study: Study, batch: int) -> None:
             [(row["case"], row["bytes"] / 2**20, row["bytes"] / size) for row in rows("memory")],
         ),
     )
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    run(Options(Path("runs/benchmark/overhead")))

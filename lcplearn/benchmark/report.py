@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,19 @@ pre { background: #f5f5f5; padding: .7em; font-size: 12px; overflow-x: auto; } n
 def write_report(folders: Iterable[str | Path], output: str | Path) -> None:
     """Gather the studies of some folders, those that answer a question first.
 
+    Folders without a finished study, as that of `fuzz`, are left out with a word.
+
     Raises:
-        ValueError: A folder without a finished study.
+        ValueError: No folder has a finished study, or one is damaged.
     """
-    studies = [_read(Path(folder)) for folder in folders]
+    paths = [Path(folder) for folder in folders]
+    finished = [folder for folder in paths if (folder / "summary.json").is_file()]
+    if not finished:
+        raise ValueError(f"none of {', '.join(map(str, paths))} holds a finished study")
+    for folder in paths:
+        if folder not in finished:
+            sys.stderr.write(f"left out, as it holds no finished study: {folder}\n")
+    studies = [_read(folder) for folder in finished]
     questions, chapters = [], []
     for folder, study in studies:
         sections = study["sections"]
@@ -40,9 +50,10 @@ def write_report(folders: Iterable[str | Path], output: str | Path) -> None:
 
 def _read(folder: Path) -> tuple[Path, dict[str, Any]]:
     try:
-        return folder, json.loads((folder / "summary.json").read_text())
-    except (OSError, ValueError):
-        raise ValueError(f"{folder} holds no finished study: summary.json is missing or damaged") from None
+        study = json.loads((folder / "summary.json").read_text())
+        return folder, {"name": study["name"], "sections": study["sections"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ValueError(f"{folder / 'summary.json'} is damaged: run its command again") from None
 
 
 def _section(folder: Path, section: dict[str, Any]) -> str:

@@ -62,7 +62,7 @@ def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
                         linestyle=look.linestyle, markersize=4)  # fmt: skip
     left.loglog(dt, direct[0]["position_error"] * dt / dt[0], color="#999999", linewidth=0.8, label="first order")
     left.set_xlabel("step size dt [s]")
-    left.set_ylabel("error")
+    left.set_ylabel("error [m], or relative to the energy")
     left.legend(fontsize=8, frameon=False)
     left.set_title(f"{scene}: errors, the same for all formulations", fontsize=10)
     for name, look in LOOKS.items():
@@ -75,7 +75,7 @@ def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
         if name == "direct":
             for row, a, b in zip(own[1::3], x[1::3], y[1::3], strict=True):
                 label = f"dt {float(row['dt']):.2g}"
-                right.annotate(label, (a, b), (5, 3), textcoords="offset points", fontsize=7)
+                right.annotate(label, (a, b), (-5, -3), textcoords="offset points", fontsize=7, ha="right", va="top")
     right.set_xlabel("CPU time of a trajectory of 1 s [s]")
     right.set_ylabel("largest position error [m]")
     right.legend(fontsize=8, frameon=False, loc="lower left")

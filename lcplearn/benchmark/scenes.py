@@ -1,7 +1,7 @@
 """`benchmark scenes`: what rows that a scene does not need cost, and which dt and formulation give a wanted error."""
 
-import time
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,12 +21,11 @@ from lcplearn.benchmark.scene_cases import (
 from lcplearn.benchmark.scene_figures import error_time, time_bars
 from lcplearn.benchmark.study import Options, Row, Study, Table
 
-KEY = ("part", "scene", "formulation", "dt", "batch")
+KEY = ("part", "scene", "dt", "batch")
 COLUMNS = (
-    "rows", "velocity_difference", "step_us", "step_low_us", "step_high_us", "full_over_this", "steps", "seconds",
-    "position_error", "end_error", "energy_error", "penetration",
+    "formulation", "rows", "velocity_difference", "step_us", "step_low_us", "step_high_us", "full_over_this", "steps",
+    "seconds", "position_error", "end_error", "energy_error", "penetration",
 )  # fmt: skip
-BLANK: Row = dict.fromkeys(COLUMNS, "")
 STEP_SIZES = tuple(10.0 ** (-k / 3) for k in range(3, 13))  # [s] 0.1 to 1e-4
 BATCHES = (1, 100, 10_000)
 
@@ -35,75 +34,79 @@ def run(options: Options) -> None:
     """Measure and report."""
     study = Study("scenes", options, KEY, COLUMNS)
     for key in study.remaining(plan(options.quick), seconds=expected_seconds):
-        part, scene, formulation, dt, batch = key
+        part, scene, dt, batch = key
         if part == "step":
-            row = step_row(str(scene), str(formulation), float(dt), int(batch), 15 if options.quick else 51)
+            rows = step_rows(str(scene), float(dt), int(batch), 15 if options.quick else 51, options.seed)
         else:
-            row = motion_row(str(scene), str(formulation), float(dt), 3 if options.quick else 7)
-        study.add(key, BLANK | row)
+            rows = motion_rows(str(scene), float(dt), 3 if options.quick else 7)
+        study.add(key, *rows.values())
     report(study)
 
 
 def plan(quick: bool) -> Iterable[tuple[Any, ...]]:
     """Keys of all rows."""
-    for scene, formulations in SCENES.items():
-        for formulation in formulations:
-            for batch in BATCHES[: 2 if quick else 3]:
-                yield "step", scene, formulation, 0.01, batch
-            for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1]:
-                yield "motion", scene, formulation, dt, 1
+    for scene in SCENES:
+        yield from (("step", scene, 0.01, batch) for batch in BATCHES[: 2 if quick else 3])
+        yield from (("motion", scene, dt, 1) for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1])
 
 
-def expected_seconds(part: Any, scene: Any, formulation: Any, dt: Any, batch: Any) -> float:
-    """Rough cost of a row of the full run."""
-    return 1.0 + 1e-4 * batch if part == "step" else 8 * 2e-4 * DURATION / dt
+def expected_seconds(part: Any, scene: Any, dt: Any, batch: Any) -> float:
+    """Rough cost of a key of the full run."""
+    each = 0.3 + 1e-4 * batch if part == "step" else 8 * 8e-5 * DURATION / dt
+    return each * len(SCENES[scene])
 
 
-def step_row(scene: str, formulation: str, dt: float, batch: int, repeats: int) -> Row:
-    """Compare one step of a formulation with the full one on random states.
+def step_rows(scene: str, dt: float, batch: int, repeats: int, seed: int) -> dict[str, Row]:
+    """Compare one step of each formulation with the full one on random states, in turns in one process.
 
     Returns:
-        rows; velocity_difference, the largest [m/s]; step_us, time of a step of one block, with quartiles;
-        full_over_this, CPU time of a full step over one of this formulation, in turns in one process.
+        By formulation: rows; velocity_difference, the largest [m/s]; step_us, time of a step of one block, with
+        quartiles; full_over_this, CPU time of a full step over one of this formulation.
     """
-    states = random_states(scene, batch, seed=0)
-    chosen, full = (SCENES[scene][name].build(dt) for name in (formulation, "full"))
-    many = random_states(scene, max(batch, 1000), seed=1)
-    difference = (chosen(many)[:, 1] - full(many)[:, 1]).abs().max()
-    calls = {"full": lambda: full(states), "this": lambda: chosen(states)}
+    states = random_states(scene, batch, seed)
+    many = random_states(scene, max(batch, 1000), seed + 1)
+    steps = {name: formulation.build(dt) for name, formulation in SCENES[scene].items()}
+    calls = {name: partial(step, states) for name, step in steps.items()}
+    for call in calls.values():
+        call()
     timings = interleave(calls, repeats)
-    timing = timings["this"]
+    truth = steps["full"](many)[:, 1]
     return {
-        "rows": SCENES[scene][formulation].rows,
-        "velocity_difference": float(difference),
-        "step_us": timing.wall / batch * 1e6,
-        "step_low_us": timing.low / batch * 1e6,
-        "step_high_us": timing.high / batch * 1e6,
-        "full_over_this": timings["full"].over(timing)[0],
+        name: {
+            "formulation": name,
+            "rows": SCENES[scene][name].rows,
+            "velocity_difference": float((step(many)[:, 1] - truth).abs().max()),
+            "step_us": timings[name].wall / batch * 1e6,
+            "step_low_us": timings[name].low / batch * 1e6,
+            "step_high_us": timings[name].high / batch * 1e6,
+            "full_over_this": timings["full"].over(timings[name])[0],
+        }
+        for name, step in steps.items()
     }
 
 
-def motion_row(scene: str, formulation: str, dt: float, repeats: int) -> Row:
-    """Follow one block for a second and compare with the exact motion.
+def motion_rows(scene: str, dt: float, repeats: int) -> dict[str, Row]:
+    """Follow one block for a second by each formulation, in turns, and compare with the exact motion.
 
     Returns:
-        seconds of one trajectory (CPU time, median); position_error, the largest at an instant [m]; end_error [m]
-        (where a slide stops; how high the first bounce goes; where a fall rests); energy_error, the largest over the
-        energy at the start (free fall: lost before impact); penetration, the deepest [m].
+        By formulation: seconds of one trajectory (CPU time, median); position_error, the largest at an instant [m];
+        end_error [m] (where a slide stops; how high the first bounce goes; where a fall rests); energy_error, the
+        largest over the energy at the start (free fall: lost before impact); penetration, the deepest [m].
     """
-    step = SCENES[scene][formulation].build(dt)
     count = round(DURATION / dt)
-    path = roll(step, start(scene), count)
-    seconds = []
-    for _ in range(repeats):
-        began = time.process_time()
-        roll(step, start(scene), count)
-        seconds.append(time.process_time() - began)
+    calls = {name: partial(roll, formulation.build(dt), start(scene), count)
+             for name, formulation in SCENES[scene].items()}  # fmt: skip
+    paths = {name: call() for name, call in calls.items()}
+    timings = interleave(calls, repeats)
     return {
-        "rows": SCENES[scene][formulation].rows,
-        "steps": count,
-        "seconds": sorted(seconds)[len(seconds) // 2],
-        **motion_errors(scene, path, dt),
+        name: {
+            "formulation": name,
+            "rows": SCENES[scene][name].rows,
+            "steps": count,
+            "seconds": timings[name].cpu,
+            **motion_errors(scene, path, dt),
+        }
+        for name, path in paths.items()
     }
 
 
@@ -117,7 +120,7 @@ def roll(step: Step, state: Tensor, count: int) -> Tensor:
 
 
 def motion_errors(scene: str, path: Tensor, dt: float) -> dict[str, float]:
-    """Errors of one trajectory against the exact one; see `motion_row`."""
+    """Errors of one trajectory against the exact one; see `motion_rows`."""
     x, v = path.unbind(-1)
     at = dt * torch.arange(len(x), dtype=x.dtype)
     x_exact, v_exact = exact(scene, at)
@@ -171,7 +174,7 @@ def report(study: Study) -> None:
         study.say(
             f"Which step size and formulation for a {scene}?",
             END_ERROR[scene],
-            table=_wanted(of_scene),
+            table=_by_step_size(of_scene),
             figure=error_time(scene, of_scene),
         )
     study.finish()
@@ -185,14 +188,14 @@ END_ERROR = {
 }
 
 
-def _wanted(rows: list[Row]) -> Table:
-    """For each wanted position error the largest dt that reaches it, and the time of a trajectory with it."""
+def _by_step_size(rows: list[Row]) -> Table:
+    """Errors, the same for all formulations, and the time of a trajectory by each."""
     names = list(dict.fromkeys(str(row["formulation"]) for row in rows))
+    errors = ("position_error", "end_error", "energy_error", "penetration")
     table = []
-    for wanted in (1e-1, 1e-2, 1e-3, 1e-4):
-        good = [row for row in rows if float(row["position_error"]) <= wanted]
-        dt = max((float(row["dt"]) for row in good), default=float("nan"))
-        found = {row["formulation"]: float(row["seconds"]) * 1e3 for row in good if row["dt"] == dt}
-        if found:
-            table.append((wanted, dt, *(found.get(name, float("nan")) for name in names)))
-    return Table(("position error [m]", "dt [s]", *(f"{name} [ms]" for name in names)), table)
+    for dt in sorted({float(row["dt"]) for row in rows}, reverse=True):
+        own = {row["formulation"]: row for row in rows if row["dt"] == dt}
+        seconds = [float(own[name]["seconds"]) for name in names]
+        table.append((dt, *(own["direct"][column] for column in errors), *(1e3 * value for value in seconds)))
+    heads = ("position error [m]", "end error [m]", "energy error [-]", "penetration [m]")
+    return Table(("dt [s]", *heads, *(f"{name} [ms]" for name in names)), table)

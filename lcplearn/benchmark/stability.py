@@ -146,8 +146,7 @@ def verdict(case: HardCase, answer: Answer, error: float, batch_safe: bool, meth
 
 def noise_row(push: str, entries: str, sigma: float, form: str, samples: int, seed: int) -> Row:
     """A row of the noise study."""
-    found = noise_study.stick_share(form, push, entries, sigma, samples=samples, seed=seed)
-    return {name: found[name] for name in ("solved", "sticks", "nearly_sticks")}
+    return dict(noise_study.stick_share(form, push, entries, sigma, samples=samples, seed=seed))
 
 
 def report(study: Study, left_out: str) -> None:

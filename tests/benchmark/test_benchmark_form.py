@@ -88,7 +88,7 @@ def test_the_report_is_one_page_without_links_to_elsewhere_and_questions_come_fi
 
 
 def test_report_of_an_unfinished_study_ends_in_one_sentence(tmp_path):
-    with pytest.raises(ValueError, match="holds no finished study"):
+    with pytest.raises(ValueError, match="holds a finished study"):
         write_report([tmp_path], tmp_path / "page.html")
 
 
