@@ -72,7 +72,7 @@ def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
         x, y = ([float(row[column]) for row in own] for column in ("seconds", "position_error"))
         right.loglog(x, y, label=f"{name} ({own[0]['rows']:g})" if own[0]["rows"] else name, color=look.color,
                      marker=look.marker, linestyle=look.linestyle, markersize=5)  # fmt: skip
-        if name == "direct":
+        if name == "closed form":
             for row, a, b in zip(own[1::3], x[1::3], y[1::3], strict=True):
                 label = f"dt {float(row['dt']):.2g}"
                 right.annotate(label, (a, b), (-5, -3), textcoords="offset points", fontsize=7, ha="right", va="top")
