@@ -83,11 +83,11 @@ def _quick(seed: int, slides: bool) -> Iterable[tuple[Any, ...]]:
 def expected_seconds(part: Any, model: Any, noise: Any, size: Any, seed: Any) -> float:
     """Rough cost of a training of the full run."""
     if part == "slides":
-        return 12.0
+        return 6.0
     if part != "simulated":
         return 0.05
-    slow = {"mlp": 5.0, "force_mlp": 5.0, "traditional": 5.0, "psd": 5.0, "psd_skew": 5.0}
-    return 1.5 + slow.get(str(model), 0.3 if "10-step" not in model else 2.0) * (0.5 + float(size) / 1000)
+    slow = {"mlp": 2.0, "force_mlp": 2.0, "traditional": 2.0, "psd": 2.0, "psd_skew": 2.0}
+    return 0.7 + slow.get(str(model), 0.15 if "10-step" not in model else 0.8) * (0.5 + float(size) / 1000)
 
 
 def markov_row(model: str, part: str, lifted: modes.ModeData, seed: int) -> Row:

@@ -67,8 +67,10 @@ def expected_seconds(
 ) -> float:
     """Rough cost of a row."""
     if part != "case":
-        return 0.05
-    return 0.02 if "pivoting" in str(method) or method == "diagonal" else 0.1 + 3e-4 * len(by_name[family, name].q) ** 2
+        return 0.02
+    return (
+        0.01 if "pivoting" in str(method) or method == "diagonal" else 0.03 + 8e-5 * len(by_name[family, name].q) ** 2
+    )
 
 
 def case_row(case: HardCase, method: str) -> Row:
