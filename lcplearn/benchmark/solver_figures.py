@@ -93,6 +93,7 @@ def _labels(figure: "Figure", x: str, y: str) -> None:
 
 def _finish(ax: "Axes", family: str) -> None:
     ax.set(xscale="log", yscale="log")
+    whole_decades(ax, "x")
     whole_decades(ax, "y")
     ax.set_title(family, fontsize=10)
     ax.tick_params(labelsize=8)
