@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from lcplearn.benchmark.methods import peers
-from lcplearn.lcp.residuals import default_tolerance, equilibrate, judge
+from lcplearn.lcp.residuals import TINY, default_tolerance, equilibrate, judge, multiply
 from lcplearn.lcp.solution import Status
 from lcplearn.lcp.solve import solve_lcp
 
@@ -78,11 +78,11 @@ def equilibrated_residual(M: np.ndarray, q: np.ndarray, z: np.ndarray) -> np.nda
 
     Part (b) asks for the sign of rounding noise, of which peers promise nothing.
     """
-    d = equilibrate(torch.from_numpy(np.ascontiguousarray(M))).numpy()
-    with np.errstate(all="ignore"):
-        w = (M @ z[..., None])[..., 0] + q
-        residual = np.abs(np.minimum(z / d, d * w)).max(-1) / np.maximum(np.abs(d * q).max(-1), 1e-300)
-    return np.where(np.isfinite(residual), residual, np.inf)
+    data, offset, point = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M, q, z))
+    d = equilibrate(data)
+    natural = torch.minimum(point / d, d * (multiply(data, point) + offset)).abs().amax(-1)
+    residual = natural / (d * offset).abs().amax(-1).clamp_min(TINY)
+    return torch.where(residual.isfinite(), residual, torch.inf).numpy()
 
 
 def _judged(

@@ -68,9 +68,9 @@ def expected_seconds(
     """Rough cost of a row."""
     if part != "case":
         return 0.02
-    return (
-        0.01 if "pivoting" in str(method) or method == "diagonal" else 0.03 + 8e-5 * len(by_name[family, name].q) ** 2
-    )
+    if "pivoting" in str(method) or method == "diagonal":
+        return 0.01
+    return 0.03 + 8e-5 * len(by_name[family, name].q) ** 2
 
 
 def case_row(case: HardCase, method: str) -> Row:

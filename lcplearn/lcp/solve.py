@@ -70,7 +70,7 @@ def solve_lcp(
     if not (method == "auto" and tol is None and max_iter is None and smoothing == 0):
         check_options(method, tol, max_iter, smoothing)
     _check_tensors(M, q)
-    if M.shape[:-1] != q.shape:
+    if M.dim() > 2 and M.shape[:-1] != q.shape:
         M, q = _broadcast(M, q)
     if initial_basis is not None:
         if method not in ("auto", "pivoting"):
