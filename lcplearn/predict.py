@@ -99,7 +99,7 @@ def write(path: str | Path, trajectory: Trajectory, dt: float) -> None:
         ValueError: several trajectories for a CSV file, or another kind of file.
     """
     path = Path(path)
-    positions, velocities, mode = (tensor[..., 0].numpy() for tensor in trajectory)
+    positions, velocities, mode = (tensor[..., 0].numpy() for tensor in trajectory[:3])
     time = np.arange(positions.shape[-1]) * dt
     if path.suffix == ".npz":
         np.savez(path, time=time, positions=positions, velocities=velocities, mode=mode)

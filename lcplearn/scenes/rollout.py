@@ -1,34 +1,14 @@
 """Trajectories of a scene: one step after another."""
 
 from collections.abc import Callable
-from enum import IntEnum
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from lcplearn.scenes.scene import Mode, Trajectory
 
-class Mode(IntEnum):
-    """What a contact does during a step."""
-
-    STICK = 0
-    SLIP = 1
-    SEPARATION = 2
-
-
-class Trajectory(NamedTuple):
-    """States and contact modes over T steps.
-
-    Attributes:
-        positions: Positions at the T + 1 instants [m].
-        velocities: Velocities at the T + 1 instants [m/s].
-        mode: `Mode` values of each contact during each of the T steps.
-    """
-
-    positions: Float[Tensor, "*batch T+1 nq"]
-    velocities: Float[Tensor, "*batch T+1 nv"]
-    mode: Int[Tensor, "*batch T contacts"]
+__all__ = ["Block", "Mode", "Trajectory", "rollout"]
 
 
 Step = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

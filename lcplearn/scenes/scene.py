@@ -1,0 +1,130 @@
+"""What all that moves can do: advance a state by one step under a drive; and rollouts, step after step."""
+
+from enum import IntEnum
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lcplearn.lcp.solution import LCPSolution
+from lcplearn.scenes.space import Space
+
+
+class Mode(IntEnum):
+    """What a contact does during a step."""
+
+    STICK = 0
+    SLIP = 1
+    SEPARATION = 2
+
+
+class Drive(NamedTuple):
+    """What acts on a scene during a step (or, with a dimension T before the last, during T steps).
+
+    Attributes:
+        force: External force [N], or force and torque [N m], one for each velocity.
+        friction: Measured friction of the step [N], for models that need it; None if there is none.
+    """
+
+    force: Float[Tensor, "*batch nv"]
+    friction: Float[Tensor, "*batch 2"] | None = None
+
+    def at(self, k: int) -> "Drive":
+        """Drive of step k, of a drive over T steps."""
+        return Drive(self.force[..., k, :], None if self.friction is None else self.friction[..., k, :])
+
+
+class Step(NamedTuple):
+    """What a step gives.
+
+    Attributes:
+        state: The next state: positions, then velocities.
+        mode: `Mode` of each contact during the step.
+        solution: Solution of the step's LCP; None where none was solved.
+        solved: Whether the step is right: its LCP solved and, where it was iterated, settled; None without an LCP.
+    """
+
+    state: Float[Tensor, "*batch nq_plus_nv"]
+    mode: Int[Tensor, "*batch contacts"]
+    solution: LCPSolution | None = None
+    solved: Bool[Tensor, "*batch"] | None = None
+
+
+class Trajectory(NamedTuple):
+    """States and contact modes over T steps.
+
+    Attributes:
+        positions: Positions at the T + 1 instants.
+        velocities: Velocities at the T + 1 instants.
+        mode: `Mode` values of each contact during each of the T steps.
+        solved: `Step.solved` of each step; None where no step has an LCP.
+    """
+
+    positions: Float[Tensor, "*batch T+1 nq"]
+    velocities: Float[Tensor, "*batch T+1 nv"]
+    mode: Int[Tensor, "*batch T contacts"]
+    solved: Bool[Tensor, "*batch T"] | None = None
+
+
+@runtime_checkable
+class Scene(Protocol):
+    """A scene or a learned model: whoever has these can be rolled out, scored, drawn and compared.
+
+    Attributes:
+        space: What a state is.
+        contacts: Number of contacts whose mode a step tells.
+        dt: Step size [s].
+    """
+
+    @property
+    def space(self) -> Space: ...
+
+    @property
+    def contacts(self) -> int: ...
+
+    @property
+    def dt(self) -> float: ...
+
+    def advance(self, state: Tensor, drive: Drive) -> Step:
+        """Advance a state [*batch, nq + nv] by one step of dt."""
+        ...
+
+
+def rollout(scene: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], drive: Drive) -> Trajectory:
+    """Advance a state T times.
+
+    Batch dimensions of state, drive and of the scene's own parameters broadcast. Gradients flow through all steps.
+
+    Args:
+        scene: What moves.
+        state: Positions, then velocities, at the start.
+        drive: What acts during each step: force [*batch, T, nv] with T >= 1. The force of step k acts from instant k
+            to k + 1.
+
+    Returns:
+        The trajectory, with the start as its first instant.
+
+    Raises:
+        ValueError: drive.force has fewer than two dimensions or no step, or state has another number of columns.
+    """
+    force, space = drive.force, scene.space
+    if force.ndim < 2 or force.shape[-2] == 0:
+        raise ValueError(f"forces: expected shape [*batch, T, {space.nv}] with T >= 1, got {list(force.shape)}")
+    space.split(state)
+    batch = torch.broadcast_shapes(state.shape[:-1], force.shape[:-2])
+    state = state.expand(*batch, state.shape[-1])
+    states, modes, solved = [state], [], []
+    for k in range(force.shape[-2]):
+        step = scene.advance(state, drive.at(k))
+        state = step.state
+        states.append(state)
+        modes.append(step.mode)
+        if step.solved is not None:
+            solved.append(step.solved)
+    # The first state lacks the dimensions that the scene's own batched parameters add.
+    path = torch.stack(torch.broadcast_tensors(*states), dim=-2)
+    positions, velocities = space.split(path)
+    mode = torch.stack(torch.broadcast_tensors(*modes), dim=-2)
+    right = torch.stack(torch.broadcast_tensors(*solved), dim=-1) if solved else None
+    return Trajectory(positions, velocities, mode, right)
