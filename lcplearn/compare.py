@@ -1,10 +1,12 @@
 """Put runs side by side: python -m lcplearn.compare RUNS...
 
-RUNS are run folders, or folders above them. Runs that differ only in their seed share a row, which shows medians.
+RUNS are run folders, or folders above them. Runs that differ in their seed alone share a row: medians, with the
+extremes in brackets. A run that diverged counts as worse than all others.
 """
 
 import argparse
 import json
+import math
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,8 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Value = float | None
-# Settings that don't make runs different things to compare.
-_SILENT = ("seed", "data.seed", "ckpt_path", "threads", "logger.", "trainer.")
+# Settings that change nothing in what is learned; any other difference makes another row.
+_SILENT = ("seed", "data.seed", "ckpt_path", "allow_changes", "logger.", "trainer.enable_progress_bar", "resumed.from")
 _HEADERS = {
     "velocity_rmse": "one-step [m/s]",
     "stick_accuracy": "stick",
@@ -45,18 +47,28 @@ _FAR = {
 }
 
 
+# Figures of which more is better; of all others less is, or neither.
+_MORE_IS_BETTER = ("stick_accuracy", "rest_share")
+
+
 class Row(NamedTuple):
     """Runs that share all settings but the seed.
 
     Attributes:
         label: What sets them apart from the other rows.
         runs: How many they are.
-        values: Median of each figure; None where no run has it.
+        seeds: How many different seeds they have.
+        diverged: How many of them diverged in training.
+        values: Median of each figure; None where no run has it, infinite where half of them or more have no number.
+        extremes: Smallest and largest of each figure that has a median.
     """
 
     label: str
     runs: int
+    seeds: int
+    diverged: int
     values: dict[str, Value]
+    extremes: dict[str, tuple[float, float]]
 
 
 def read_runs(folders: Iterable[str | Path]) -> list[Row]:
@@ -67,24 +79,33 @@ def read_runs(folders: Iterable[str | Path]) -> list[Row]:
     """
     paths: list[Path] = []
     for folder in folders:
-        found = sorted(path.parent for path in Path(folder).rglob("metrics.json"))
+        found = sorted({path.resolve().parent for path in Path(folder).rglob("metrics.json")})
         if not found:
             raise ValueError(f"{folder} holds no finished run: there is no metrics.json in or below it.")
         paths += [path for path in found if path not in paths]
-    metrics = [_read(path / "metrics.json", json.loads) for path in paths]
     configs = [_read(path / "config.yaml", yaml.safe_load) for path in paths]
-    groups: dict[str, list[dict[str, Value]]] = {}
-    for label, values in zip(_labels(configs), metrics, strict=True):
-        groups.setdefault(label, []).append(values)
-    rows = [Row(label, len(runs), _medians(runs)) for label, runs in groups.items()]
-    return sorted(rows, key=lambda row: row.values["stop_error_median_mm"] or row.values["velocity_rmse"] or 1e300)
+    groups: dict[str, list[int]] = {}
+    for index, label in enumerate(_labels(configs)):
+        groups.setdefault(label, []).append(index)
+    metrics = [_read(path / "metrics.json", json.loads) for path in paths]
+    rows = [
+        _row(label, [configs[index] for index in group], [metrics[index] for index in group])
+        for label, group in groups.items()
+    ]
+    return sorted(rows, key=_error)
 
 
 def format_table(rows: Sequence[Row]) -> str:
     """A markdown table of the figures that any row has."""
     keys = [key for key in _HEADERS if any(row.values.get(key) is not None for row in rows)]
-    cells = [["run", "seeds", *(_HEADERS[key] for key in keys)]]
-    cells += [[row.label, str(row.runs), *(_number(row.values.get(key)) for key in keys)] for row in rows]
+    counts = ["seeds"]
+    counts += ["runs"] if any(row.runs != row.seeds for row in rows) else []
+    counts += ["diverged"] if any(row.diverged for row in rows) else []
+    cells = [["run", *counts, *(_HEADERS[key] for key in keys)]]
+    for row in rows:
+        numbers = {"seeds": str(row.seeds), "runs": str(row.runs), "diverged": f"{row.diverged} of {row.runs}"}
+        label = row.label.replace("|", "\\|")  # a bare one would end the cell
+        cells.append([label, *(numbers[name] for name in counts), *(_cell(row, key) for key in keys)])
     widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
 
     def line(texts: Sequence[str]) -> str:
@@ -202,18 +223,53 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _medians(runs: Sequence[Mapping[str, Value]]) -> dict[str, Value]:
-    columns = {key: [value for run in runs if (value := run.get(key)) is not None] for key in _HEADERS}
-    return {key: statistics.median(values) if values else None for key, values in columns.items()}
+def _row(label: str, configs: Sequence[Mapping[str, Any]], runs: Sequence[Mapping[str, Any]]) -> Row:
+    values: dict[str, Value] = {}
+    extremes = {}
+    for key in _HEADERS:
+        found = [_figure(run.get(key)) for run in runs]
+        if all(value is None for value in found):
+            values[key] = None
+            continue
+        worst = -math.inf if key in _MORE_IS_BETTER else math.inf
+        # Equal settings ask for equal figures: a run without one has diverged.
+        counted = [worst if value is None or math.isinf(value) else value for value in found]
+        # The higher or lower of two middle ones, not their mean: half a diverged pair is no figure.
+        middle = statistics.median_low if worst < 0 else statistics.median_high
+        finite = all(map(math.isfinite, counted))
+        values[key], extremes[key] = (statistics.median if finite else middle)(counted), (min(counted), max(counted))
+    seeds = {config.get("seed") for config in configs}
+    return Row(label, len(runs), len(seeds), sum("diverged" in run for run in runs), values, extremes)
+
+
+def _figure(value: Any) -> Value:
+    """A figure of metrics.json, where what is not finite is the word "diverged"."""
+    return math.inf if value == "diverged" else value
+
+
+def _error(row: Row) -> float:
+    """What rows are sorted by: the error of stops, or else of one step."""
+    found = (row.values["stop_error_median_mm"], row.values["velocity_rmse"])
+    return next((value for value in found if value is not None), math.inf)
 
 
 def _shown(value: Value) -> float:
     """A logarithmic axis has no zero."""
-    return float("nan") if value is None else max(value, 1e-17)
+    return float("nan") if value is None or math.isinf(value) else max(value, 1e-17)
 
 
-def _number(value: Value) -> str:
-    return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+def _cell(row: Row, key: str) -> str:
+    value = row.values.get(key)
+    if value is None:
+        return ""
+    low, high = map(_number, row.extremes[key])
+    return _number(value) + (f" ({low} to {high})" if low != high else "")
+
+
+def _number(value: float) -> str:
+    if math.isinf(value):
+        return "diverged"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

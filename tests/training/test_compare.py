@@ -11,7 +11,7 @@ from lcplearn import compare
 from lcplearn.training.metrics import KEYS
 
 
-def run(folder: Path, target: str, config: dict[str, Any] | None = None, **figures: float) -> None:
+def run(folder: Path, target: str, config: dict[str, Any] | None = None, **figures: float | None) -> None:
     folder.mkdir(parents=True)
     model = {"_target_": f"lcplearn.formulations.{target}"}
     (folder / "config.yaml").write_text(yaml.safe_dump({"model": model, "seed": 0} | (config or {})))
@@ -23,15 +23,60 @@ def test_runs_that_differ_in_their_seed_share_a_row_of_medians(tmp_path: Path) -
         run(tmp_path / f"a{seed}", "structured.Structured", {"seed": seed}, velocity_rmse=error, predict_us=400.0)
     run(tmp_path / "b", "baselines.MLP", velocity_rmse=0.1, predict_us=40.0)
     rows = compare.read_runs([tmp_path])
-    assert [(row.label, row.runs, row.values["velocity_rmse"]) for row in rows] == [
-        ("Structured", 3, 3e-9),
-        ("MLP", 1, 0.1),
-    ]
+    found = [(row.label, row.seeds, row.values["velocity_rmse"], row.extremes["velocity_rmse"]) for row in rows]
+    assert found == [("Structured", 3, 3e-9, (1e-9, 1e-3)), ("MLP", 1, 0.1, (0.1, 0.1))]
+    assert "3e-09 (1e-09 to 0.001)" in compare.format_table(rows)
+
+
+def test_the_same_seed_twice_is_one_seed(tmp_path: Path) -> None:
+    for name in "ab":
+        run(tmp_path / name, "structured.Structured", velocity_rmse=0.1)
+    (row,) = rows = compare.read_runs([tmp_path])
+    assert (row.seeds, row.runs) == (1, 2)
+    assert compare.format_table(rows).splitlines()[0].split("|")[2:4] == [" seeds ", " runs "]
+
+
+def test_runs_of_other_training_share_no_row(tmp_path: Path) -> None:
+    for epochs in (3, 100):
+        run(tmp_path / str(epochs), "baselines.MLP", {"trainer": {"max_epochs": epochs, "gradient_clip_val": 1.0}})
+    labels = {row.label for row in compare.read_runs([tmp_path])}
+    assert labels == {"MLP trainer.max_epochs=3", "MLP trainer.max_epochs=100"}
+
+
+def test_a_run_that_diverged_counts_as_worse_than_all_others(tmp_path: Path) -> None:
+    """Five good runs stand above one good and four without a figure; a word and a missing figure count alike."""
+    for seed in range(5):
+        run(tmp_path / f"good{seed}", "structured.Structured", {"seed": seed}, velocity_rmse=0.02, stick_accuracy=0.9)
+        run(tmp_path / f"bad{seed}", "baselines.MLP", {"seed": seed})
+    figures = [{"velocity_rmse": 0.01, "stick_accuracy": 1.0}, {"velocity_rmse": "diverged"}]
+    figures += 3 * [{"velocity_rmse": None, "diverged": "in epoch 2"}]
+    for seed, values in enumerate(figures):
+        (tmp_path / f"bad{seed}" / "metrics.json").write_text(json.dumps(dict.fromkeys(KEYS) | values))
+    good, bad = rows = compare.read_runs([tmp_path])
+    assert (good.label, bad.label, bad.seeds, bad.diverged) == ("Structured", "MLP", 5, 3)
+    assert bad.values["velocity_rmse"] == float("inf")
+    assert bad.values["stick_accuracy"] == -float("inf")
+    assert compare.format_table(rows).count("diverged (0.01 to diverged)") == 1
+    compare.draw(rows)
+
+
+def test_the_median_of_an_even_number_is_a_diverged_one_if_half_of_them_are(tmp_path: Path) -> None:
+    for seed, error in enumerate((0.01, 0.02, None, None)):
+        run(tmp_path / str(seed), "baselines.MLP", {"seed": seed}, velocity_rmse=error)
+    (row,) = compare.read_runs([tmp_path])
+    assert row.values["velocity_rmse"] == float("inf")
+
+
+def test_an_error_of_exactly_zero_comes_first(tmp_path: Path) -> None:
+    run(tmp_path / "a", "baselines.MLP", velocity_rmse=0.1)
+    run(tmp_path / "b", "relu.ReLU", velocity_rmse=0.0)
+    assert [row.label for row in compare.read_runs([tmp_path])] == ["ReLU", "MLP"]
 
 
 def test_a_row_is_named_by_what_sets_it_apart(tmp_path: Path) -> None:
     for horizon in (1, 10):
-        run(tmp_path / str(horizon), "baselines.MLP", {"loss": {"horizon": horizon}, "threads": horizon})
+        config = {"loss": {"horizon": horizon}, "logger": {"save_dir": f"runs/{horizon}"}}
+        run(tmp_path / str(horizon), "baselines.MLP", config)
     assert [row.label for row in compare.read_runs([tmp_path])] == ["MLP loss.horizon=1", "MLP loss.horizon=10"]
 
 
