@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     if options.command == "report":
-        from lcplearn.benchmark.report import write_report
+        from lcplearn.benchmark.harness.report import write_report
 
         write_report(options.folders, options.output)
         print(options.output)
@@ -47,15 +47,15 @@ def _run(options: argparse.Namespace) -> None:
 
     torch.set_num_threads(options.threads)
     if options.command == "fuzz":
-        from lcplearn.benchmark.fuzz import run as run_fuzz
+        from lcplearn.benchmark.fuzz.run import run as run_fuzz
 
         run_fuzz(options)
         return
-    from lcplearn.benchmark.study import Options
+    from lcplearn.benchmark.harness.study import Options
 
     default = Path("runs/benchmark") / (options.command + ("-quick" if options.quick else ""))
     chosen = Options(options.output or default, options.quick, options.threads, options.seed)
-    import_module(f"lcplearn.benchmark.{options.command}").run(chosen)
+    import_module(f"lcplearn.benchmark.{options.command}.run").run(chosen)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -5,9 +5,9 @@ import re
 import pytest
 
 from lcplearn.benchmark.__main__ import main
-from lcplearn.benchmark.figures import STYLES, new_figure, style
-from lcplearn.benchmark.report import write_report
-from lcplearn.benchmark.study import Options, Study, Table, format_table, read_rows
+from lcplearn.benchmark.harness.figures import STYLES, new_figure, style
+from lcplearn.benchmark.harness.report import write_report
+from lcplearn.benchmark.harness.study import Options, Study, Table, format_table, read_rows
 
 KEY, COLUMNS = ("family", "n"), ("seconds", "solved")
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from lcplearn.benchmark import fuzz, fuzz_checks
-from lcplearn.benchmark.fuzz_cases import Batch, batch
-from lcplearn.benchmark.fuzz_checks import check, enumerate_solution, residual
+from lcplearn.benchmark.fuzz import checks as fuzz_checks
+from lcplearn.benchmark.fuzz import run as fuzz
+from lcplearn.benchmark.fuzz.cases import Batch, batch
+from lcplearn.benchmark.fuzz.checks import check, enumerate_solution, residual
 from lcplearn.lcp.residuals import judge
 from lcplearn.lcp.solution import Status
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from real_data import real_data
 
-from lcplearn.benchmark import models, training_runs
-from lcplearn.benchmark.modes import chain, entropy, foretell, modes_from_forces, score, simulate_modes
-from lcplearn.benchmark.study import Options
+from lcplearn.benchmark.harness.study import Options
+from lcplearn.benchmark.models import run as models
+from lcplearn.benchmark.models import training as training_runs
+from lcplearn.benchmark.models.modes import chain, entropy, foretell, modes_from_forces, score, simulate_modes
 from lcplearn.datasets import simulate_sliding_block
 from lcplearn.formulations import Physical
 

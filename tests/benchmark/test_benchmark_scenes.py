@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from lcplearn.benchmark.scene_cases import DURATION, SCENES, exact, random_states, start
-from lcplearn.benchmark.scenes import motion_errors, motion_rows, roll, step_rows
+from lcplearn.benchmark.scenes.cases import DURATION, SCENES, exact, random_states, start
+from lcplearn.benchmark.scenes.run import motion_errors, motion_rows, roll, step_rows
 
 ROWS = {"sliding block": 2, "one-way block": 1, "falling block": 1, "bouncing block": 1}
 

@@ -5,13 +5,15 @@ import pytest
 import torch
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark import problems, solvers, speed_checks
-from lcplearn.benchmark.accuracy_checks import check_family, check_gradient, check_hard
-from lcplearn.benchmark.gradient_error import gradient_errors, line, reference
-from lcplearn.benchmark.measuring import exponent, interleave, peak_memory
-from lcplearn.benchmark.methods import peers
-from lcplearn.benchmark.solvers import families, measure, plan, size
-from lcplearn.benchmark.study import Options, Study, read_rows
+from lcplearn.benchmark.acceptance import speed as speed_checks
+from lcplearn.benchmark.acceptance.accuracy import check_family, check_gradient, check_hard
+from lcplearn.benchmark.harness.measuring import exponent, interleave, peak_memory
+from lcplearn.benchmark.harness.study import Options, Study, read_rows
+from lcplearn.benchmark.problems import families as problems
+from lcplearn.benchmark.solvers import run as solvers
+from lcplearn.benchmark.solvers.gradients import gradient_errors, line, reference
+from lcplearn.benchmark.solvers.peers import peers
+from lcplearn.benchmark.solvers.run import families, measure, plan, size
 
 FAMILIES = ("F1 sliding block direct n=2", "F3 polygon n=8", "F5 positive definite n=10")
 
@@ -122,7 +124,7 @@ def test_checks_of_families_pass(family, tmp_path):
 
 
 def test_a_solver_that_lies_fails_its_check(tmp_path, monkeypatch):
-    from lcplearn.benchmark import accuracy_checks
+    from lcplearn.benchmark.acceptance import accuracy as accuracy_checks
 
     truthful = accuracy_checks.solve
     monkeypatch.setattr(accuracy_checks, "solve", lambda *a: truthful(*a)._replace(statuses=["UNSOLVED"] * 40))
@@ -145,8 +147,8 @@ def test_without_a_peer_its_checks_say_that_they_were_skipped(tmp_path, monkeypa
 
 
 def test_acceptance_says_what_is_below_its_floor(tmp_path, capsys, monkeypatch):
-    from lcplearn.benchmark import acceptance
-    from lcplearn.benchmark.check import Check, Finding
+    from lcplearn.benchmark.acceptance import run as acceptance
+    from lcplearn.benchmark.acceptance.check import Check, Finding
 
     checks = (
         Check("fine", "<= 1", "", "x", lambda quick: ["a"], lambda case, options: Finding(0.5, True, True), 1.0),

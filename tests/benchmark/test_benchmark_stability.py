@@ -5,11 +5,14 @@ import pytest
 import torch
 from real_data import real_data
 
-from lcplearn.benchmark import methods, noise_study, solving, stability
-from lcplearn.benchmark.hard_cases import hard_families, published_cases
-from lcplearn.benchmark.noise_study import stick_share
-from lcplearn.benchmark.solving import Answer, gradient_error, solve
-from lcplearn.benchmark.sweeps import SWEEPS, sweep
+from lcplearn.benchmark.problems.hard_cases import hard_families, published_cases
+from lcplearn.benchmark.solvers import methods as solving
+from lcplearn.benchmark.solvers import peers as methods
+from lcplearn.benchmark.solvers.methods import Answer, gradient_error, solve
+from lcplearn.benchmark.stability import noise as noise_study
+from lcplearn.benchmark.stability import run as stability
+from lcplearn.benchmark.stability.noise import stick_share
+from lcplearn.benchmark.stability.sweeps import SWEEPS, sweep
 
 CASES = hard_families()
 
@@ -101,7 +104,7 @@ def test_a_solver_that_raises_is_wrong(monkeypatch):
     def broken(*_, **__):
         raise IndexError("no such row")
 
-    monkeypatch.setattr("lcplearn.benchmark.solving.solve_lcp", broken)
+    monkeypatch.setattr("lcplearn.benchmark.solvers.methods.solve_lcp", broken)
     row = stability.case_row(CASES[0], "pivoting")
     assert row["status"] == "RAISED IndexError"
     assert row["verdict"] == "wrong"

@@ -7,7 +7,7 @@ from lcp.oracles import planted, random_family
 from torch.autograd import gradcheck, gradgradcheck
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark.problems import stacked_cubes
+from lcplearn.benchmark.problems.families import stacked_cubes
 
 METHODS = ("pivoting", "interior_point")
 FRICTION = [[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]]  # notes 2.5 with mass = dt = 1

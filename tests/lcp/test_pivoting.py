@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lcp.oracles import has_solution, natural_residual
 
-from lcplearn.benchmark import problems
-from lcplearn.benchmark.problems import Problems
+from lcplearn.benchmark.problems import families as problems
+from lcplearn.benchmark.problems.families import Problems
 from lcplearn.lcp import pivoting
 from lcplearn.lcp.residuals import judge
 from lcplearn.lcp.solution import LCPSolution, Status

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark import problems
+from lcplearn.benchmark.problems import families as problems
 from lcplearn.lcp import pivoting
 from lcplearn.lcp.residuals import equilibrate, judge
 

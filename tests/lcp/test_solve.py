@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from lcp.oracles import FAMILIES, has_solution, natural_residual, planted, random_family
 
 from lcplearn import Status, solve_lcp
-from lcplearn.benchmark import problems
+from lcplearn.benchmark.problems import families as problems
 
 METHODS = ("pivoting", "interior_point")
 entries = st.integers(-3, 3)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from lcplearn.benchmark import model_figures, modes
-from lcplearn.benchmark.model_figures import median
-from lcplearn.benchmark.study import Options, Row, Study, Table
-from lcplearn.benchmark.training_runs import (
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table
+from lcplearn.benchmark.models import figures as model_figures
+from lcplearn.benchmark.models import modes
+from lcplearn.benchmark.models.figures import median
+from lcplearn.benchmark.models.training import (
     METRICS,
     MODE_COLUMNS,
     SIMULATED,

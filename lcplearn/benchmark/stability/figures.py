@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcplearn.benchmark import noise_study
-from lcplearn.benchmark.figures import heat_map, new_figure, one_legend, style
-from lcplearn.benchmark.study import Row
-from lcplearn.benchmark.sweeps import LABELS, SWEEPS
+from lcplearn.benchmark.harness.figures import heat_map, new_figure, one_legend, style
+from lcplearn.benchmark.harness.study import Row
+from lcplearn.benchmark.stability import noise as noise_study
+from lcplearn.benchmark.stability.sweeps import LABELS, SWEEPS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 import torch
 
-from lcplearn.benchmark import problems
-from lcplearn.benchmark.check import Check, Finding, skipped
-from lcplearn.benchmark.gradient_error import gradient_errors, reference
-from lcplearn.benchmark.hard_cases import HardCase, hard_families, published_cases
-from lcplearn.benchmark.problems import Problems
-from lcplearn.benchmark.solving import solve
-from lcplearn.benchmark.study import Options
+from lcplearn.benchmark.acceptance.check import Check, Finding, skipped
+from lcplearn.benchmark.harness.study import Options
+from lcplearn.benchmark.problems import families as problems
+from lcplearn.benchmark.problems.families import Problems
+from lcplearn.benchmark.problems.hard_cases import HardCase, hard_families, published_cases
+from lcplearn.benchmark.solvers.gradients import gradient_errors, reference
+from lcplearn.benchmark.solvers.methods import solve
 
 CHUNK = 250  # problems that are in memory at once
 Family = Callable[[np.random.Generator, int], Problems]

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lcplearn.benchmark.measuring import interleave
-from lcplearn.benchmark.scene_cases import (
+from lcplearn.benchmark.harness.measuring import interleave
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table
+from lcplearn.benchmark.scenes.cases import (
     DURATION,
     HEIGHT,
     SCENES,
@@ -18,8 +19,7 @@ from lcplearn.benchmark.scene_cases import (
     random_states,
     start,
 )
-from lcplearn.benchmark.scene_figures import error_time, time_bars
-from lcplearn.benchmark.study import Options, Row, Study, Table
+from lcplearn.benchmark.scenes.figures import error_time, time_bars
 
 KEY = ("part", "scene", "dt", "batch")
 COLUMNS = (

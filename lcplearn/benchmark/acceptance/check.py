@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from lcplearn.benchmark.study import Options
+from lcplearn.benchmark.harness.study import Options
 
 SKIPPED = float("nan")
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcplearn.benchmark.figures import BLUE, ORANGE, new_figure, one_legend, style
-from lcplearn.benchmark.study import Row
+from lcplearn.benchmark.harness.figures import BLUE, ORANGE, new_figure, one_legend, style
+from lcplearn.benchmark.harness.study import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

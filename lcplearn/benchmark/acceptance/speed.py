@@ -8,13 +8,14 @@ import numpy as np
 import torch
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark import overhead, problems
-from lcplearn.benchmark.check import Check, Finding, skipped
-from lcplearn.benchmark.gradient_error import line
-from lcplearn.benchmark.measuring import Timing, interleave
-from lcplearn.benchmark.methods import peers
-from lcplearn.benchmark.problems import Problems
-from lcplearn.benchmark.study import Options
+from lcplearn.benchmark.acceptance.check import Check, Finding, skipped
+from lcplearn.benchmark.harness.measuring import Timing, interleave
+from lcplearn.benchmark.harness.study import Options
+from lcplearn.benchmark.overhead import run as overhead
+from lcplearn.benchmark.problems import families as problems
+from lcplearn.benchmark.problems.families import Problems
+from lcplearn.benchmark.solvers.gradients import line
+from lcplearn.benchmark.solvers.peers import peers
 from lcplearn.lcp import pivoting
 
 AGAINST_QUANTECON = "forward against quantecon, batch 1024"

@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark import problems
-from lcplearn.benchmark.gradient_error import Reference, gradient_errors, reference
-from lcplearn.benchmark.measuring import exponent, interleave, peak_memory
-from lcplearn.benchmark.methods import METHODS, missing_peers, peers
-from lcplearn.benchmark.problems import Problems
-from lcplearn.benchmark.solver_figures import (
+from lcplearn.benchmark.harness.measuring import exponent, interleave, peak_memory
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table, Value
+from lcplearn.benchmark.problems import families as problems
+from lcplearn.benchmark.problems.families import Problems
+from lcplearn.benchmark.solvers.figures import (
     draw_gradients,
     draw_growth,
     draw_work_precision,
 )
-from lcplearn.benchmark.study import Options, Row, Study, Table, Value
+from lcplearn.benchmark.solvers.gradients import Reference, gradient_errors, reference
+from lcplearn.benchmark.solvers.peers import METHODS, missing_peers, peers
 from lcplearn.lcp.residuals import default_tolerance
 
 Family = Callable[[np.random.Generator, int], Problems]

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lcplearn.benchmark.figures import new_figure, one_legend, style, whole_decades
-from lcplearn.benchmark.study import Row
+from lcplearn.benchmark.harness.figures import new_figure, one_legend, style, whole_decades
+from lcplearn.benchmark.harness.study import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lcplearn.benchmark import problems
-from lcplearn.benchmark.problems import Problems
+from lcplearn.benchmark.problems import families as problems
+from lcplearn.benchmark.problems.families import Problems
 
 Generator = np.random.Generator
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from lcplearn.benchmark import noise_study, stability_figures
-from lcplearn.benchmark.hard_cases import HardCase, hard_families, published_cases
-from lcplearn.benchmark.solving import METHODS, SMOOTHED, Answer, gradient_error, solve
-from lcplearn.benchmark.study import Options, Row, Study, Table
-from lcplearn.benchmark.sweeps import SWEEPS, sweep
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table
+from lcplearn.benchmark.problems.hard_cases import HardCase, hard_families, published_cases
+from lcplearn.benchmark.solvers.methods import METHODS, SMOOTHED, Answer, gradient_error, solve
+from lcplearn.benchmark.stability import figures as stability_figures
+from lcplearn.benchmark.stability import noise as noise_study
+from lcplearn.benchmark.stability.sweeps import SWEEPS, sweep
 
 KEY = ("part", "family", "case", "x", "method")
 COLUMNS = (

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lcplearn.benchmark.modes import ModeData, Score, modes_from_forces, score
-from lcplearn.benchmark.study import Row
+from lcplearn.benchmark.harness.study import Row
+from lcplearn.benchmark.models.modes import ModeData, Score, modes_from_forces, score
 from lcplearn.datasets import BlockData, read_cube_slides, simulate_sliding_block
 from lcplearn.formulations import FORMULATIONS, Formulation
 from lcplearn.lcp.solve import solve_lcp

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lcplearn.benchmark.fuzz_cases import Batch, batch
-from lcplearn.benchmark.fuzz_checks import Finding, check
+from lcplearn.benchmark.fuzz.cases import Batch, batch
+from lcplearn.benchmark.fuzz.checks import Finding, check
 
 MOST_OF_A_CHECK = 5  # findings of one check and kind that are kept
 PATIENCE = 120.0  # seconds without a new batch after which the child hangs
@@ -37,7 +37,7 @@ def hunt(folder: Path, seed: int, seconds: float) -> int:
     end, index, progress = time.monotonic() + seconds, 0, folder / "batch_in_progress"
     while (left := end - time.monotonic()) > 0:
         progress.write_text(str(index))
-        command = [sys.executable, "-m", "lcplearn.benchmark.fuzz", str(folder), str(seed), str(index), str(left)]
+        command = [sys.executable, "-m", "lcplearn.benchmark.fuzz.run", str(folder), str(seed), str(index), str(left)]
         child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         hung = _wait(child, progress)
         errors = child.communicate()[1]

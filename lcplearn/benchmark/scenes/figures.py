@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lcplearn.benchmark.figures import BLACK, BLUE, GREEN, RED, SKY, Style, new_figure, one_legend
-from lcplearn.benchmark.study import Row
+from lcplearn.benchmark.harness.figures import BLACK, BLUE, GREEN, RED, SKY, Style, new_figure, one_legend
+from lcplearn.benchmark.harness.study import Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

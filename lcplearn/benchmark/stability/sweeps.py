@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lcplearn.benchmark.problems import ill_conditioned, mass_ratio_stack, positive_definite
-from lcplearn.benchmark.solving import solve
-from lcplearn.benchmark.study import Row
+from lcplearn.benchmark.harness.study import Row
+from lcplearn.benchmark.problems.families import ill_conditioned, mass_ratio_stack, positive_definite
+from lcplearn.benchmark.solvers.methods import solve
 
 BATCH = 20
 FRICTION = 0.4 * 9.81  # [N] largest friction force of a block of 1 kg

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.benchmark.full_block import FULL_ROWS, full_velocity
+from lcplearn.benchmark.scenes.full_block import FULL_ROWS, full_velocity
 from lcplearn.scenes import BouncingBlock, FallingBlock, Mode, OneWayBlock, SlidingBlock
 from lcplearn.scenes.rollout import Block
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark.measuring import interleave, peak_memory
-from lcplearn.benchmark.problems import RANDOM_FAMILIES, positive_definite
-from lcplearn.benchmark.study import Options, Row, Study, Table
+from lcplearn.benchmark.harness.measuring import interleave, peak_memory
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table
+from lcplearn.benchmark.problems.families import RANDOM_FAMILIES, positive_definite
 
 COLUMNS = ("forward", "both", "forward_empty", "both_empty", "forward_interface", "both_interface", "to_q", "bytes")
 SIZES = (2, 3, 8, 24)

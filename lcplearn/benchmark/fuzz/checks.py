@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark.fuzz_cases import Batch
+from lcplearn.benchmark.fuzz.cases import Batch
 from lcplearn.lcp.solution import LCPSolution, Status
 
 EPS = np.finfo(np.float64).eps

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from lcplearn.benchmark.methods import peers
+from lcplearn.benchmark.solvers.peers import peers
 from lcplearn.lcp.residuals import TINY, default_tolerance, equilibrate, judge, multiply
 from lcplearn.lcp.solution import Status
 from lcplearn.lcp.solve import solve_lcp

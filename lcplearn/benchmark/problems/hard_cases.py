@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lcplearn.benchmark.problems import Problems, fathi, hilbert, mass_ratio_stack, murty, redundant_contacts
-from lcplearn.benchmark.problems import stewart_trinkle as friction_lcp
+from lcplearn.benchmark.problems.families import Problems, fathi, hilbert, mass_ratio_stack, murty, redundant_contacts
+from lcplearn.benchmark.problems.families import stewart_trinkle as friction_lcp
 from lcplearn.datasets.files import find, read_npz
 
 PUBLISHED_FILE = "lcp_cases.npz"

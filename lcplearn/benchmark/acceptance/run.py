@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lcplearn.benchmark import accuracy_checks, speed_checks
-from lcplearn.benchmark.check import Check
-from lcplearn.benchmark.figures import STYLES, new_figure
-from lcplearn.benchmark.methods import missing_peers
-from lcplearn.benchmark.study import Options, Row, Study, Table, Value, show
+from lcplearn.benchmark.acceptance import accuracy as accuracy_checks
+from lcplearn.benchmark.acceptance import speed as speed_checks
+from lcplearn.benchmark.acceptance.check import Check
+from lcplearn.benchmark.harness.figures import STYLES, new_figure
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table, Value, show
+from lcplearn.benchmark.solvers.peers import missing_peers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

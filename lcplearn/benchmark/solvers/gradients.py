@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from lcplearn import solve_lcp
-from lcplearn.benchmark.problems import Problems
+from lcplearn.benchmark.problems.families import Problems
 
 STEP = 4e-3  # relative to the data: truncation (of sixth order) and rounding (eps * condition / STEP) both stay small
 AGREEMENT = 1e-7

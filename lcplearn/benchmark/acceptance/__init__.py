@@ -1,0 +1,1 @@
+"""`benchmark acceptance`: each figure that the layer must show."""

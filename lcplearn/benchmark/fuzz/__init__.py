@@ -1,0 +1,1 @@
+"""`benchmark fuzz`: the hunt for wrong answers."""

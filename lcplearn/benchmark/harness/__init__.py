@@ -1,0 +1,1 @@
+"""How every study is kept, timed, drawn and reported; knows nothing of what is measured."""

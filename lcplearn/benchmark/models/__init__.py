@@ -1,0 +1,1 @@
+"""`benchmark models`: learned formulations."""

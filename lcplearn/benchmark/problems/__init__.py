@@ -1,0 +1,1 @@
+"""The catalogue of LCPs: random families, contact from geometry, textbook and published cases."""

@@ -1,0 +1,1 @@
+"""`benchmark scenes`: rows, step sizes, errors against exact motions."""

@@ -1,0 +1,1 @@
+"""`benchmark stability`: hard cases, sweeps, noise."""
