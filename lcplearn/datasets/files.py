@@ -23,20 +23,24 @@ def find(name: str) -> Path:
     return path
 
 
-def read_npz(path: Path | str, keys: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray]:
+def read_npz(
+    path: Path | str, keys: tuple[str, ...], optional: tuple[str, ...] = (), *, finite: bool = True
+) -> dict[str, NDArray]:
     """Arrays of an NPZ file, without ever running a pickle.
 
     Args:
         path: The file.
         keys: Names of the arrays that it must hold.
         optional: Names of arrays that it may hold.
+        finite: Whether NaN and infinity are refused.
 
     Returns:
         These arrays by name, as far as they are there.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not an NPZ file, is pickled, lacks an array, or numbers in it are not finite.
+        ValueError: It is not an NPZ file, is pickled, lacks an array, or (where that is asked) numbers in it are
+            not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -58,7 +62,7 @@ def read_npz(path: Path | str, keys: tuple[str, ...], optional: tuple[str, ...] 
     for key, array in arrays.items():
         if array.dtype.kind not in "fiuU":
             raise ValueError(f"{path}: {key}: expected numbers or text, got {array.dtype}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{path}: {key}: {int((~np.isfinite(array)).sum())} values are NaN or infinite")
     return arrays
 
