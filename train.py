@@ -3,6 +3,7 @@
 conf/train.yaml says what can be set. HYDRA_FULL_ERROR=1 shows the whole traceback of an error.
 """
 
+import math
 import os
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 DEBUGGING = os.environ.get("HYDRA_FULL_ERROR") == "1"
 PROCESSES = int(os.environ.get("WORLD_SIZE", 1)) if "TORCHELASTIC_RUN_ID" in os.environ else 1  # torchrun's
-MISTAKES = (HydraException, OmegaConfBaseException, ValueError, OSError)
+MISTAKES = (HydraException, OmegaConfBaseException, ValueError, OSError, ArithmeticError)
 CONF = Path(__file__).parent / "conf"
 
 
@@ -42,7 +43,7 @@ def train(config: DictConfig) -> float:
     from lightning import seed_everything
     from lightning.pytorch.utilities import rank_zero_only
 
-    from lcplearn.training import TrainingInterrupted, fit
+    from lcplearn.training import TrainingDivergedError, TrainingInterrupted, fit
     from lcplearn.training.metrics import describe_model, format_table
 
     torch.set_num_threads(config.threads)
@@ -63,11 +64,17 @@ def train(config: DictConfig) -> float:
             patience=config.patience,
             folder=run.runtime.output_dir,
             ckpt_path=config.ckpt_path,
+            allow_changes=config.allow_changes,
             seed=config.seed,
             logger=hydra.utils.instantiate(config.logger, _convert_="all"),
             trainer=trainer,
             settings=settings,
         )
+    except TrainingDivergedError as error:
+        if run.mode.name != "MULTIRUN":
+            raise
+        print(error)  # a sweep goes on
+        return math.inf
     except TrainingInterrupted as stop:
         overrides = [override for override in run.overrides.task if not override.startswith("ckpt_path=")]
         command = " ".join(["python train.py", *overrides, f"ckpt_path={os.path.relpath(stop.checkpoint)}"])

@@ -4,13 +4,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lcplearn.training.callbacks import TrainingDivergedError
     from lcplearn.training.checkpoint import load
     from lcplearn.training.fitting import Result, TrainingInterrupted, fit
     from lcplearn.training.optimizer import Optimizer
 
-__all__ = ["Optimizer", "Result", "TrainingInterrupted", "fit", "load"]
+__all__ = ["Optimizer", "Result", "TrainingDivergedError", "TrainingInterrupted", "fit", "load"]
 
-_HOMES = {"load": "checkpoint", "Optimizer": "optimizer"}
+_HOMES = {"load": "checkpoint", "Optimizer": "optimizer", "TrainingDivergedError": "callbacks"}
 
 
 def __getattr__(name: str) -> Any:

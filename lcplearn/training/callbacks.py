@@ -1,6 +1,6 @@
 """What happens beside the optimisation: reports, early stopping, a clean stop on Ctrl-C."""
 
-import shutil
+import math
 import signal
 import threading
 from pathlib import Path
@@ -14,15 +14,17 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm import tqdm
 
 from lcplearn.datasets import BlockData
-from lcplearn.training.metrics import one_step
+from lcplearn.training.checkpoint import read
+from lcplearn.training.metrics import KEYS, one_step
 from lcplearn.training.module import VALIDATION, FormulationModule
+from lcplearn.training.writing import copy, write_figures
 
 TAGS = {
     "velocity_rmse": "val/velocity_rmse",
-    "stick_accuracy": "mode/stick_accuracy",
-    "false_stick": "mode/false_stick",
-    "lcp_residual": "residual/lcp",
-    "unsolved_share": "solve/unsolved_share",
+    "stick_accuracy": "val/stick_accuracy",
+    "false_stick": "val/false_stick",
+    "lcp_residual": "val/lcp_residual",
+    "unsolved_share": "val/unsolved_share",
 }
 
 
@@ -35,7 +37,7 @@ class Report(pl.Callback):
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.validation = move_data_to_device(self.data.validation, pl_module.device)
         if isinstance(trainer.logger, TensorBoardLogger):
-            pairs = {name: ["Multiline", [f"param/{name}$", f"param/{name}_true"]] for name in ("mu", "mass")}
+            pairs = {name: ["Multiline", [f"parameters/{name}$", f"parameters/{name}_true"]] for name in ("mu", "mass")}
             trainer.logger.experiment.add_custom_scalars({"learned against true": pairs})
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
@@ -44,10 +46,11 @@ class Report(pl.Callback):
         model = pl_module.model
         found = one_step(model, self.validation)
         scalars = {tag: value for name, tag in TAGS.items() if (value := found[name]) is not None}
+        scalars |= {tag: float(trainer.callback_metrics[tag]) for tag in (VALIDATION, "val/loss")}
         for name, value in model.physical_parameters().items():
-            scalars[f"param/{name}"] = value
+            scalars[f"parameters/{name}"] = value
             if getattr(self.data, name) is not None:
-                scalars[f"param/{name}_true"] = getattr(self.data, name)
+                scalars[f"parameters/{name}_true"] = getattr(self.data, name)
         trainer.logger.log_metrics(scalars, step=trainer.global_step)
 
 
@@ -60,18 +63,81 @@ class EarlyStop(EarlyStopping):
             super().on_validation_end(trainer, pl_module)
 
 
+class TrainingDivergedError(ArithmeticError):
+    """Training gave a number that is not finite; the message is one sentence on what to do."""
+
+
+class Divergence(pl.Callback):
+    """End a training that has diverged, before its numbers get into a checkpoint.
+
+    Args:
+        folder: Of the run, whose metrics.json says so; with several processes their parent learns it only there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        terms = [name for name, value in (outputs or {}).items() if not math.isfinite(float(value))]
+        self._end(trainer, pl_module, f"the loss term '{terms[0]}'" if terms else None)
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        error = float(trainer.callback_metrics.get(VALIDATION, 0.0))
+        self._end(trainer, pl_module, None if math.isfinite(error) else "the error on the validation data")
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        wrong = [name for name, value in pl_module.named_parameters() if not bool(value.isfinite().all())]
+        self._end(trainer, pl_module, f"the parameter {wrong[0]}" if wrong else None)
+
+    def _end(self, trainer: pl.Trainer, module: Any, what: str | None) -> None:
+        diverged = what is not None
+        if trainer.world_size > 1:  # a process that stops alone leaves the others waiting
+            diverged = trainer.strategy.reduce_boolean_decision(diverged, all=False)
+        if not diverged:
+            return
+        optimizer, epoch = module.optimizer, trainer.current_epoch
+        cure = (
+            "use optimizer=adam, or a larger optimizer.lbfgs_after"
+            if optimizer.finishes(epoch)
+            else f"lower optimizer.lr, which is {optimizer.lr:g}"
+        )
+        sentence = f"Training diverged in epoch {epoch + 1}: {what or 'a number'} is not finite; {cure}."
+        if (self.folder / "best.ckpt").is_file():
+            sentence += f" {self.folder / 'best.ckpt'} holds the best model before."
+        if trainer.is_global_zero:
+            write_figures(self.folder / "metrics.json", dict.fromkeys(KEYS) | {"diverged": sentence})
+        raise TrainingDivergedError(sentence)
+
+
 class BestCheckpoint(ModelCheckpoint):
-    """Keep `best.ckpt`, also over a resumption in another folder: Lightning would forget what was best before."""
+    """Keep `best.ckpt`, also over a resumption in another folder: Lightning would forget what was best before.
+
+    It is written before `last.ckpt`, which so never knows an older score.
+
+    Args:
+        folder: Of the run.
+        resumed: The checkpoint that is resumed, beside which the best model so far lies.
+    """
+
+    def __init__(self, folder: Path, resumed: str | Path | None = None) -> None:
+        super().__init__(
+            folder, "best", monitor=VALIDATION, enable_version_counter=False, save_on_train_epoch_end=False
+        )
+        self.resumed = resumed
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        before = Path(state_dict["best_model_path"])
-        if before.is_file() and self.dirpath is not None and before.parent != Path(self.dirpath):
-            now = Path(self.dirpath) / before.name
-            now.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(before, now)
-            moved = {"dirpath": self.dirpath, "best_model_path": str(now), "kth_best_model_path": str(now)}
-            state_dict = state_dict | moved | {"best_k_models": {str(now): state_dict["best_model_score"]}}
-        super().load_state_dict(state_dict)
+        beside = Path(self.resumed or "").with_name("best.ckpt")  # the folder may have been moved since
+        before = next((path for path in (beside, Path(state_dict["best_model_path"])) if path.is_file()), None)
+        if before is None or self.dirpath is None:
+            return  # what was best is lost: better none than a score without its model
+        now = Path(self.dirpath) / before.name
+        score = read(before, "cpu")["callbacks"][self.state_key]["best_model_score"]
+        copy(before, now)
+        here = {"dirpath": self.dirpath, "best_model_path": str(now), "kth_best_model_path": str(now)}
+        best = {"best_model_score": score, "best_k_models": {str(now): score}, "kth_value": score}
+        super().load_state_dict(state_dict | here | best)
 
 
 class EpochBar(ProgressBar):
@@ -97,8 +163,13 @@ class EpochBar(ProgressBar):
             values = {VALIDATION: float(trainer.callback_metrics[VALIDATION])} | pl_module.model.physical_parameters()
             self.bar.set_postfix({name: f"{value:.3g}" for name, value in values.items()}, refresh=False)
 
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
+        self.teardown(trainer, pl_module, "fit")
+
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         if self.bar is not None:
+            if trainer.should_stop and self.bar.n < (self.bar.total or 0):
+                self.bar.set_description_str("stopped early")
             self.bar.close()
 
 
@@ -128,6 +199,9 @@ class LastCheckpoint(pl.Callback):
         trainer.should_stop = trainer.should_stop or self.stopped
         if trainer.should_stop or done == trainer.max_epochs or done % self.every == 0:
             trainer.save_checkpoint(self.path, weights_only=False)
+
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
+        self._restore()
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         self._restore()

@@ -1,6 +1,8 @@
 """Checkpoints: what is stored of a model, and how to get it back without Lightning."""
 
 import importlib
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +19,32 @@ def describe(model: Formulation) -> dict[str, Any]:
     return {"class": f"{cls.__module__}.{cls.__qualname__}", "arguments": dict(model.arguments)}
 
 
-def load(path: str | Path, map_location: str | torch.device | None = None) -> Formulation:
+def load(path: str | Path, map_location: str | torch.device | None = None, *, trust: bool = False) -> Formulation:
     """Load a trained model, ready to predict.
 
     Only plain values are unpickled (`weights_only=True`). The model's class is imported by the name that stands in the
-    file and must be a `Formulation`.
+    file. Importing runs code, so only lcplearn's own modules and those that are imported already are looked at, unless
+    the file is trusted.
 
     Args:
         path: `best.ckpt` or `last.ckpt` of a run.
         map_location: Where to put the tensors; as they were saved by default.
+        trust: Import whatever module the file names.
 
     Returns:
         The model, in evaluation mode.
 
     Raises:
-        ValueError: no such file, not a checkpoint of lcplearn, or its class is missing or has changed.
+        ValueError: no such file, not a checkpoint of lcplearn, its class is missing, has changed or would have to be
+            imported from elsewhere, or a parameter is not finite.
     """
     checkpoint = read(path, map_location)
     module, _, name = checkpoint["formulation"]["class"].rpartition(".")
+    if not (trust or module in sys.modules or module.startswith("lcplearn.")):
+        raise ValueError(
+            f"{path} was made with the class {module}.{name}, and importing {module} runs its code: if you trust the "
+            f"file, import {module} first, or load with trust=True (--trust on a command line)."
+        )
     try:
         cls = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
@@ -42,10 +52,13 @@ def load(path: str | Path, map_location: str | torch.device | None = None) -> Fo
     if not (isinstance(cls, type) and issubclass(cls, Formulation)):
         raise ValueError(f"{path} names the class {module}.{name}, which is not a Formulation.")
     state = {key.removeprefix(PREFIX): value for key, value in checkpoint["state_dict"].items()}
+    wrong = [key for key, value in state.items() if not bool(torch.as_tensor(value).isfinite().all())]
+    if wrong:
+        raise ValueError(f"{path}: {wrong[0]} is not finite; the training that wrote it had diverged.")
     try:
         model = cls(**checkpoint["formulation"]["arguments"])
         model.load_state_dict(state)
-    except (TypeError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path} was made with another version of {module}.{name}: {reason}") from error
     return model.to(map_location).eval() if map_location is not None else model.eval()
@@ -62,30 +75,73 @@ def read(path: str | Path, map_location: str | torch.device | None = None) -> di
     try:
         checkpoint = torch.load(path, map_location=map_location, weights_only=True)
     except Exception as error:  # torch.load raises whatever its unpickler met: any of it means the same to the user
-        raise ValueError(f"{path} is not a checkpoint that can be loaded safely: {type(error).__name__}.") from error
-    if not isinstance(checkpoint, dict) or "formulation" not in checkpoint or "state_dict" not in checkpoint:
+        raise ValueError(
+            f"{path} is not a checkpoint that can be loaded safely: it is truncated, another kind of file, or holds "
+            f"more than plain values ({type(error).__name__})."
+        ) from error
+    if not (isinstance(checkpoint, dict) and _well_formed(checkpoint)):
         raise ValueError(f"{path} is not a checkpoint of lcplearn.")
     return checkpoint
 
 
-def check_resumable(path: str | Path, model: Formulation, objective: dict[str, Any], max_epochs: int) -> None:
-    """Refuse a checkpoint of another model or loss, or one with nothing left to train.
+def _well_formed(checkpoint: Mapping[str, Any]) -> bool:
+    formulation, state = checkpoint.get("formulation"), checkpoint.get("state_dict")
+    return (
+        isinstance(formulation, dict)
+        and isinstance(formulation.get("class"), str)
+        and isinstance(formulation.get("arguments"), dict)
+        and isinstance(state, dict)
+        and all(isinstance(value, torch.Tensor) for value in state.values())
+    )
+
+
+def check_resumable(
+    path: str | Path, ours: Mapping[str, Any], max_epochs: int, *, allow_changes: bool
+) -> dict[str, Any]:
+    """Refuse a checkpoint of another training, or one with nothing left to train.
+
+    Args:
+        path: The checkpoint.
+        ours: What this training does, as in a checkpoint: formulation, objective and training.
+        max_epochs: How many epochs this training has.
+        allow_changes: Whether seed, data, optimizer and batch size may differ.
+
+    Returns:
+        What differs, by name: [before, now].
 
     Raises:
         ValueError: one sentence that names the first difference.
     """
     checkpoint = read(path)
-    saved, ours = checkpoint["formulation"], describe(model)
-    if saved["class"] != ours["class"]:
-        raise ValueError(f"{path} holds {saved['class']}, but the settings ask for {ours['class']}: change model=.")
-    for name in sorted(saved["arguments"].keys() | ours["arguments"].keys()):
-        before, now = saved["arguments"].get(name, "its default"), ours["arguments"].get(name, "its default")
-        if before != now:
-            raise ValueError(f"{path} was trained with model.{name}={before}, but the settings say {now}.")
+    if not {"objective", "training", "epoch"} <= set(checkpoint):
+        raise ValueError(f"{path} holds a model, but no training that could go on.")
+    saved, now = checkpoint["formulation"], ours["formulation"]
+    if saved["class"] != now["class"]:
+        raise ValueError(f"{path} holds {saved['class']}, but the settings ask for {now['class']}: change model=.")
+    for name, (before, after) in _differences(saved["arguments"], now["arguments"]).items():
+        raise ValueError(f"{path} was trained with model.{name}={before}, but the settings say {after}.")
     for name, before in checkpoint["objective"].items():
-        if before != objective[name]:
-            raise ValueError(f"{path} was trained with {name} {before}, but the settings say {objective[name]}.")
+        if before != ours["objective"][name]:
+            raise ValueError(
+                f"{path} was trained with {name} {before}, but the settings say {ours['objective'][name]}."
+            )
+    changed = _differences(checkpoint["training"], ours["training"])
+    if changed and not allow_changes:
+        # That recordings differ follows from another setting, unless it is the only difference.
+        name, (before, after) = next(iter(sorted(changed.items(), key=lambda item: item[0] == "data.recordings")))
+        raise ValueError(
+            f"{path} was trained with {name}={before}, but the settings say {after}: to go on all the same, "
+            "add allow_changes=true."
+        )
     # Lightning counts the epoch that is under way; a checkpoint is written at its end.
     done = checkpoint["epoch"] + 1
     if done >= max_epochs:
         raise ValueError(f"{path} has finished its {done} epochs: set trainer.max_epochs above {done} to go on.")
+    return changed
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, list[Any]]:
+    default = "its default"
+    names = sorted(before.keys() | now.keys())
+    pairs = {name: [before.get(name, default), now.get(name, default)] for name in names}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}

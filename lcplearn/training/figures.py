@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRUE: dict[str, Any] = {"color": "black", "linewidth": 5.0, "alpha": 0.25}
+ROUNDING = 2.2e-16  # of a velocity of 1 m/s
 LEARNED: dict[str, Any] = {"color": "tab:red", "linewidth": 1.4}
 
 
@@ -75,8 +76,10 @@ def rollouts(model: Formulation, data: BlockData, count: int = 3) -> "Figure":
         steps = int(test.steps[row])
         time = torch.arange(steps + 1) * data.dt
         ax.plot(time, true[row, : steps + 1], label=name, **TRUE)
-        ax.plot(time, _shown(velocity[row, : steps + 1], true[row]), label="rolled out from the start", **LEARNED)
-        low, high = ax.get_ylim()
+        predicted = velocity[row, : steps + 1]
+        low, high = _limits(predicted, true[row, : steps + 1])
+        far = 10.0 * max(-low, high)  # outside of the axes, where matplotlib can still draw it
+        ax.plot(time, predicted.clamp(-far, far), label="rolled out from the start", **LEARNED)
         ax.set(ylim=(low - 0.22 * (high - low), high), ylabel="velocity [m/s]")
         if data.test.true_velocities is not None:  # a measured velocity is never exactly zero
             _strip(ax, time, true[row, : steps + 1], 0.01, "black", "true at rest", alpha=0.35)
@@ -93,12 +96,18 @@ def stops(model: Formulation, data: BlockData) -> "Figure":
     position, _ = rollout(model, test)
     rows = torch.arange(len(test.steps))
     predicted, recorded = (1e3 * (x[rows, test.steps] - x[:, 0]) for x in (position, test.positions))
+    diverged = int((~predicted.isfinite()).sum())
     ax, reach = axes[0][0], float(recorded.max())
     ax.plot([0.0, reach], [0.0, reach], color="0.6", linewidth=1.0)
     ax.plot(recorded, predicted, ".", color=LEARNED["color"], alpha=0.6)
     error = (predicted - recorded).abs().quantile(0.5)
     ax.set(xlabel="recorded distance [mm]", ylabel="predicted distance [mm]", aspect="equal")
-    ax.set_title(f"{len(rows)} slides to rest: median error {error:.1f} mm", fontsize=11)
+    if not bool((predicted.abs() < 3.0 * reach).all()):
+        ax.set(ylim=(-0.05 * reach, 3.0 * reach))
+    ax.set_title(
+        f"{len(rows)} slides to rest: median error {error:.1f} mm" + (f", {diverged} diverged" if diverged else ""),
+        fontsize=11,
+    )
     ax.grid(alpha=0.3)
     return figure
 
@@ -123,10 +132,12 @@ def error_over_horizon(model: Formulation, data: BlockData) -> "Figure":
     error = (velocity - truth(recordings))[:, 1:].abs()
     known = valid_steps(recordings)
     error = torch.where(known, error, 0.0)
+    error = torch.where(error < 1e12, error, torch.inf)  # drawn up to where it diverges
     rms = (error.square().sum(0) / known.sum(0).clamp(min=1)).sqrt()
     steps = torch.arange(1, len(rms) + 1)
     ax = axes[0][0]
     floor = 1e-17  # exact zeros, which a logarithmic axis can't show
+    ax.axhline(ROUNDING, color="0.8", linewidth=0.8, linestyle=":", label="rounding")
     ax.plot(steps, error.amax(0).clamp(min=floor), color="0.6", linewidth=1.0, label="largest")
     ax.plot(steps, rms.clamp(min=floor), label="root mean square", **LEARNED)
     ax.set(xscale="log", yscale="log", xlabel="steps since the start", ylabel="velocity error [m/s]")
@@ -136,10 +147,13 @@ def error_over_horizon(model: Formulation, data: BlockData) -> "Figure":
     return figure
 
 
-def _shown(velocity: Tensor, true: Tensor) -> Tensor:
-    """Hide what has left the picture, so that a diverged rollout doesn't flatten the truth."""
-    reach = 3.0 * true.abs().max().clamp(min=1e-3)
-    return torch.where(velocity.abs() <= reach, velocity, torch.nan)
+def _limits(predicted: Tensor, true: Tensor) -> tuple[float, float]:
+    """Of the axis: what leaves them by far is cut off, so that a diverged rollout doesn't flatten the truth."""
+    reach = 3.0 * float(true.abs().max().clamp(min=1e-3))
+    shown = torch.cat((predicted[predicted.isfinite()].clamp(-reach, reach), true))
+    low, high = float(shown.min()), float(shown.max())
+    margin = 0.05 * max(high - low, 1e-3)
+    return low - margin, high + margin
 
 
 def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", list[list["Axes"]]]:

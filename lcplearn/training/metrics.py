@@ -81,7 +81,7 @@ def one_step(model: Formulation, recordings: Recordings) -> dict[str, float | No
         "stick_accuracy": _share(still[sticks]) if simulated else None,
         "false_stick": _share(still[~sticks]) if simulated else None,
         "unsolved_share": None if solution is None else 1.0 - float(solution.solved.double().mean()),
-        "lcp_residual": None if solution is None else _finite(float(solution.residual.max())),
+        "lcp_residual": None if solution is None else float(solution.residual.max()),
     }
 
 
@@ -108,7 +108,7 @@ def evaluate(model: Formulation, data: BlockData, *, train_seconds: float | None
         train_seconds: Reported as it comes.
 
     Returns:
-        All `KEYS`; None where a figure does not apply or is not finite. `UNITS` says what each is.
+        All `KEYS`; None where a figure does not apply, infinite where it is not finite. `UNITS` says what each is.
     """
     values: dict[str, float | None] = dict.fromkeys(KEYS)
     values |= {key: value for key, value in one_step(model, data.test).items() if key in KEYS}
@@ -125,7 +125,7 @@ def evaluate(model: Formulation, data: BlockData, *, train_seconds: float | None
     values["train_seconds"] = train_seconds
     values["predict_us"] = _predict_us(model, data.test)
     values["parameters"] = sum(p.numel() for p in model.parameters() if p.requires_grad)
-    return {key: _finite(value) for key, value in values.items()}
+    return {key: math.inf if value is not None and math.isnan(value) else value for key, value in values.items()}
 
 
 def table(metrics: Mapping[str, float | None]) -> list[tuple[str, str, str]]:
@@ -137,6 +137,8 @@ def number(value: float | None) -> str:
     """Four significant digits, as short as they go."""
     if value is None:
         return "-"
+    if math.isinf(value):
+        return "diverged"
     return str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
@@ -186,13 +188,9 @@ def _predict_us(model: Formulation, recordings: Recordings, repeats: int = 200) 
     return statistics.median(seconds) * 1e6
 
 
-def _rms(error: Tensor) -> float | None:
-    return _finite(float(error.square().mean().sqrt()))
+def _rms(error: Tensor) -> float:
+    return float(error.square().mean().sqrt())
 
 
 def _share(flags: Bool[Tensor, " n"]) -> float | None:
     return float(flags.double().mean()) if len(flags) else None
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else value

@@ -31,6 +31,7 @@ class FormulationModule(pl.LightningModule):
         horizon: Steps of a training window.
         optimizer: Optimisers and their schedule.
         log_every: Steps between two logs of the loss.
+        training: What else the training was asked for, as plain values; a resumption compares it.
     """
 
     model: Formulation
@@ -38,12 +39,19 @@ class FormulationModule(pl.LightningModule):
     started: float
 
     def __init__(
-        self, model: Formulation, *, loss: Mapping[str, float], horizon: int, optimizer: Optimizer, log_every: int = 1
+        self,
+        model: Formulation,
+        *,
+        loss: Mapping[str, float],
+        horizon: int,
+        optimizer: Optimizer,
+        log_every: int = 1,
+        training: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.model, self.loss, self.optimizer, self.horizon = model, dict(loss), optimizer, horizon
-        self.log_every = log_every
+        self.log_every, self.training_settings = log_every, dict(training or {})
         self.seconds_before, self.started = 0.0, time.perf_counter()
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
@@ -57,7 +65,7 @@ class FormulationModule(pl.LightningModule):
         for group in adam.param_groups:
             group["lr"] = self.optimizer.learning_rate(self.current_epoch, self.trainer.max_epochs or 1)
 
-    def training_step(self, windows: Windows, index: int) -> None:
+    def training_step(self, windows: Windows, index: int) -> dict[str, Tensor]:
         finishes = self.optimizer.finishes(self.current_epoch)
         active = self._optimizers()[-1 if finishes else 0]
         scale = LBFGS_SCALE if finishes else 1.0
@@ -75,9 +83,10 @@ class FormulationModule(pl.LightningModule):
         active.step(closure=closure)
         # A scalar costs 0.5 ms to log: only those that are shown are.
         if self.logger and self.global_step % self.log_every == 0:
-            scalars = {f"loss/{name}": float(value) for name, value in report.items()}
-            scalars["optimizer/lr"] = float(active.param_groups[0]["lr"])
+            scalars = {f"train/{name}": float(value) for name, value in report.items()}
+            scalars["train/lr"] = float(active.param_groups[0]["lr"])
             self.logger.log_metrics(scalars, step=self.global_step)
+        return report
 
     def validation_step(self, windows: Windows, index: int) -> None:
         # The best model is the one that predicts best as it is deployed. The loss may say otherwise: that of `direct`
@@ -85,20 +94,20 @@ class FormulationModule(pl.LightningModule):
         deployed = loss_terms(self.model, windows, {"rollout": 1.0})["rollout"].sqrt()
         total = self._total(loss_terms(self.model, windows, self.loss))
         values = {VALIDATION: deployed, "val/loss": total}
-        self.log_dict(values, sync_dist=True, batch_size=len(windows.velocity))
+        self.log_dict(values, sync_dist=True, batch_size=len(windows.velocity), logger=False)  # callbacks.Report does
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["formulation"] = describe(self.model)
-        checkpoint["objective"] = self.objective
-        checkpoint["train_seconds"] = self.seconds
+        checkpoint.update(self.described, train_seconds=self.seconds)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.seconds_before = checkpoint["train_seconds"]
 
     @property
-    def objective(self) -> dict[str, Any]:
-        """What is minimised, as plain values."""
-        return {"loss": {name: weight for name, weight in self.loss.items() if weight}, "horizon": self.horizon}
+    def described(self) -> dict[str, Any]:
+        """What is trained, what is minimised, and by what, as plain values."""
+        loss = {name: weight for name, weight in self.loss.items() if weight}
+        objective = {"loss": loss, "horizon": self.horizon}
+        return {"formulation": describe(self.model), "objective": objective, "training": self.training_settings}
 
     @property
     def seconds(self) -> float:

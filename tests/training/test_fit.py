@@ -3,18 +3,21 @@
 import json
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pytest
 import torch
+import yaml
 from lightning.pytorch import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training.helpers import QUIET, short_fit, small_data, tiny_data
 
-from lcplearn.formulations import FORMULATIONS, MLP, Formulation, Physical, Structured
-from lcplearn.training import Optimizer, TrainingInterrupted, fit, load
-from lcplearn.training.metrics import KEYS, UNITS, format_table
+from lcplearn.datasets import BlockData
+from lcplearn.formulations import FORMULATIONS, MLP, Affine, Formulation, Physical, Structured
+from lcplearn.training import Optimizer, TrainingDivergedError, TrainingInterrupted, figures, fit, load
+from lcplearn.training.metrics import KEYS, UNITS, evaluate, format_table
+from lcplearn.training.writing import replace, write_figures
 
 FRICTION = {"direct": "physical", "slack": "slack"}
 
@@ -129,7 +132,8 @@ def test_the_best_model_before_an_interruption_stays_the_best_after_it(tmp_path:
     absurd = Optimizer(lr=50.0, lbfgs_after=5)  # whatever comes after the resumption is worse
     model = Structured(dt=data.dt)
     checkpoint = tmp_path / "first" / "last.ckpt"
-    result = short_fit(model, data, tmp_path / "second", epochs=5, ckpt_path=checkpoint, optimizer=absurd)
+    result = short_fit(model, data, tmp_path / "second", epochs=5, ckpt_path=checkpoint, optimizer=absurd,
+                       allow_changes=True)  # fmt: skip
     assert all(torch.equal(value, first[f"model.{name}"]) for name, value in result.model.state_dict().items())
 
 
@@ -194,9 +198,136 @@ def test_tensorboard_shows_losses_modes_residuals_parameters_figures_and_the_tab
     events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
     tags = events.Reload().Tags()
     assert set(tags["scalars"]) >= {
-        "loss/total", "loss/prediction", "val/loss", "val/velocity_rmse", "mode/stick_accuracy", "mode/false_stick",
-        "residual/lcp", "solve/unsolved_share", "param/mu", "param/mu_true", "param/mass", "param/mass_true",
-        "hp/best_val/rollout_rmse", "test/velocity_rmse",
+        "train/total", "train/prediction", "val/loss", "val/rollout_rmse", "val/velocity_rmse", "val/stick_accuracy",
+        "val/false_stick", "val/lcp_residual", "val/unsolved_share", "parameters/mu", "parameters/mu_true",
+        "parameters/mass", "parameters/mass_true", "test/velocity_rmse",
     }  # fmt: skip
-    assert set(tags["images"]) == {"one_step_map", "rollouts", "error_over_horizon"}
+    assert {tag.partition("/")[0] for tag in tags["scalars"]} == {"parameters", "test", "train", "val"}
+    assert set(tags["images"]) == {"test/one_step_map", "test/rollouts", "test/error_over_horizon"}
     assert "results/text_summary" in tags["tensors"]
+
+
+def test_resuming_another_training_is_refused_by_name_or_written_down(tmp_path: Path) -> None:
+    data, last = tiny_data(), tmp_path / "run" / "last.ckpt"
+    short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=2)
+    other = tiny_data(noise=0.3)
+    cases: list[tuple[BlockData, dict[str, Any], str]] = [
+        (data, {"seed": 7}, "with seed=0, but the settings say 7: .* add allow_changes=true"),
+        (data, {"batch_size": 8}, "with batch_size=None, but the settings say 8"),
+        (data, {"optimizer": Optimizer(lr=0.5)}, "with optimizer.lbfgs_after=2, but the settings say None"),
+        (other, {}, r"with data\.recordings=\w+, but the settings say"),
+        (other, {"settings": {"data": {"noise": 0.3}}}, r"with data\.noise=its default, but the settings say 0\.3"),
+    ]
+    for recordings, changes, message in cases:
+        with pytest.raises(ValueError, match=message):
+            short_fit(Physical(dt=data.dt), recordings, tmp_path / "again", ckpt_path=last, **changes)
+    assert not (tmp_path / "again").exists()
+    short_fit(Physical(dt=data.dt), data, tmp_path / "again", ckpt_path=last, seed=7, allow_changes=True)
+    resumed = yaml.safe_load((tmp_path / "again" / "config.yaml").read_text())["resumed"]
+    assert resumed == {"from": str(last), "changed": {"seed": [0, 7]}, "epochs": 2}
+
+
+class Poison(Callback):
+    """From an epoch on, every prediction is NaN."""
+
+    def __init__(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
+        if trainer.current_epoch == self.epoch:
+            for parameter in pl_module.parameters():
+                parameter.data.fill_(float("nan"))
+
+
+def test_a_training_that_diverges_says_so_and_keeps_the_last_finite_best(tmp_path: Path) -> None:
+    data = tiny_data()
+    trainer = QUIET | {"check_val_every_n_epoch": 1, "callbacks": [Poison(2)]}
+    with pytest.raises(
+        TrainingDivergedError, match=r"^Training diverged in epoch 3: .*'prediction'.*lower optimizer\.lr"
+    ) as error:
+        short_fit(MLP(dt=data.dt), data, tmp_path / "run", trainer=trainer, optimizer=Optimizer())
+    assert "best.ckpt holds the best model before" in str(error.value)
+    for name in ("best.ckpt", "last.ckpt"):
+        assert bool(parameters(load(tmp_path / "run" / name)).isfinite().all())
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics == dict.fromkeys(KEYS) | {"diverged": str(error.value)}
+
+
+def test_a_rollout_that_diverges_is_a_word_in_metrics_and_is_drawn_as_far_as_it_goes(tmp_path: Path) -> None:
+    data = small_data()
+    model = Affine(dt=data.dt)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.fill_(1e3)  # 1e3^1000 is more than a double holds
+    metrics = evaluate(model, data)
+    assert metrics["rollout_rmse_1000"] == float("inf")
+    write_figures(tmp_path / "metrics.json", metrics)
+    assert json.loads((tmp_path / "metrics.json").read_text())["rollout_rmse_1000"] == "diverged"
+    assert "diverged" in format_table(metrics)
+    for name, figure in figures.draw(model, data).items():
+        figure.savefig(tmp_path / f"{name}.png")
+
+
+def test_last_ckpt_is_written_every_time_and_never_knows_an_older_score_than_best_ckpt(tmp_path: Path) -> None:
+    data, seen = tiny_data(), []
+
+    class Look(Callback):
+        """At the start of each epoch, read what kill -9 would leave."""
+
+        def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
+            if trainer.current_epoch > 0:
+                best, last = (torch.load(tmp_path / "run" / name) for name in ("best.ckpt", "last.ckpt"))
+                key = next(key for key in last["callbacks"] if key.startswith("BestCheckpoint"))
+                scores = [float(saved["callbacks"][key]["best_model_score"]) for saved in (best, last)]
+                seen.append((last["epoch"], scores[0] - scores[1]))
+
+    trainer = QUIET | {"check_val_every_n_epoch": 1, "callbacks": [Look()]}
+    short_fit(Structured(dt=data.dt), data, tmp_path / "run", trainer=trainer)
+    assert seen == [(0, 0.0), (1, 0.0), (2, 0.0)]
+
+
+def test_a_run_moved_before_it_is_resumed_keeps_its_best_model(tmp_path: Path) -> None:
+    data = tiny_data()
+    short_fit(Structured(dt=data.dt), data, tmp_path / "first", epochs=3)
+    (tmp_path / "first").rename(tmp_path / "moved")
+    best = (tmp_path / "moved" / "best.ckpt").read_bytes()
+    absurd = {"optimizer": Optimizer(lr=50.0, lbfgs_after=5), "allow_changes": True}  # all that follows is worse
+    short_fit(
+        Structured(dt=data.dt),
+        data,
+        tmp_path / "second",
+        epochs=5,
+        ckpt_path=tmp_path / "moved" / "last.ckpt",
+        **absurd,
+    )
+    assert (tmp_path / "second" / "best.ckpt").read_bytes() == best
+
+
+def test_a_file_that_could_not_be_written_whole_is_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    path.write_bytes(b"old")
+
+    def fails(file: BinaryIO) -> None:
+        file.write(b"ne")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        replace(path, fails)
+    assert path.read_bytes() == b"old"
+    replace(path, lambda file: file.write(b"new"))
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir() if file.suffix == ".ckpt"] == [
+        ("last.ckpt", b"new")
+    ]
+
+
+def test_of_two_trainings_at_once_in_a_folder_the_second_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both have looked before either has written its settings."""
+    data = tiny_data()
+    short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=1)
+    before = (tmp_path / "run" / "last.ckpt").read_bytes()
+    monkeypatch.setattr("lcplearn.training.fitting._new_folder", lambda folder: folder)
+    with pytest.raises(ValueError, match="holds a run already"):
+        short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=1)
+    assert (tmp_path / "run" / "last.ckpt").read_bytes() == before

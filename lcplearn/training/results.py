@@ -1,0 +1,70 @@
+"""What a run leaves when its training has ended: figures, pictures and the logger's page."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from lcplearn.datasets import BlockData
+from lcplearn.formulations import Formulation
+from lcplearn.training import figures
+from lcplearn.training.metrics import evaluate, table
+from lcplearn.training.writing import write_figures
+
+# The figures that stand beside the hyperparameters; metrics.json and the table have all.
+MAIN = (
+    "velocity_rmse", "stick_accuracy", "rollout_rmse_1000", "stop_error_median_mm", "rest_share", "mu_error",
+    "train_seconds",
+)  # fmt: skip
+
+
+def leave(
+    trainer: pl.Trainer, model: Formulation, data: BlockData, folder: Path, used: Mapping[str, Any], seconds: float
+) -> dict[str, float | None]:
+    """Judge the model, and write metrics.json, the pictures and the logger's page.
+
+    Args:
+        trainer: Whose logger is told.
+        model: The trained model, on the CPU.
+        data: Whose test part judges.
+        folder: The run's.
+        used: What it was trained with, by name, as HPARAMS shows it.
+        seconds: Time of training [s].
+
+    Returns:
+        The figures, see `metrics.KEYS`.
+    """
+    metrics = evaluate(model, data, train_seconds=seconds)
+    write_figures(folder / "metrics.json", metrics)
+    pictures = figures.draw(model, data)
+    for name, figure in pictures.items():
+        # Pictures are looked at side by side and far from their folder.
+        figure.suptitle(f"{type(model).__name__}   {folder.name}", x=0.01, ha="left", fontsize=8, color="0.4")
+        figure.savefig(folder / f"{name}.png", dpi=120)
+    _log(trainer, metrics, used, pictures)
+    return metrics
+
+
+def _log(
+    trainer: pl.Trainer, metrics: Mapping[str, float | None], used: Mapping[str, Any], pictures: Mapping[str, Any]
+) -> None:
+    finite = {key: float(value) for key, value in metrics.items() if value is not None and math.isfinite(value)}
+    if trainer.logger is None:
+        return
+    if not isinstance(trainer.logger, TensorBoardLogger):
+        trainer.logger.log_hyperparams(dict(used))
+        trainer.logger.log_metrics({f"test/{key}": value for key, value in finite.items()})
+        return
+    main = {f"test/{key}": finite[key] for key in MAIN if key in finite}
+    trainer.logger.log_hyperparams(dict(used), main)
+    writer = trainer.logger.experiment
+    lines = ["| figure | value | meaning |", "|---|---|---|"]
+    for cells in table(metrics):
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    writer.add_text("results", "\n".join(lines))
+    for name, figure in pictures.items():
+        writer.add_figure(f"test/{name}", figure, global_step=trainer.global_step)
+    writer.flush()
