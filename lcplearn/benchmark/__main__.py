@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, what in STUDIES.items():
         command = commands.add_parser(name, help=what, description=what)
         command.add_argument("--output", type=Path, metavar="DIR", help="folder (default: runs/benchmark/COMMAND)")
-        command.add_argument("--quick", action="store_true", help="small sizes, less than a minute")
+        command.add_argument("--quick", action="store_true", help="small sizes, half a minute to two minutes")
         _add_threads_and_seed(command)
     fuzz = commands.add_parser("fuzz", help="hunt for wrong statuses, NaN, crashes and batch dependence")
     fuzz.add_argument("--minutes", type=_at_least(1), default=1, help="how long to hunt (default: 1)")

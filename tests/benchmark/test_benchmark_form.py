@@ -67,6 +67,22 @@ def test_a_table_shows_three_digits_and_aligns_numbers_to_the_right():
     ]
 
 
+def test_a_pipe_in_a_cell_does_not_split_it_and_there_is_no_minus_zero():
+    lines = format_table(Table(("|v| < 0.01", "change"), [(1.0, -0.0)])).splitlines()
+    assert lines[0].startswith("| \\|v\\| < 0.01 |")
+    assert lines[2].split() == ["|", "1", "|", "0", "|"]
+
+
+def test_what_the_layer_must_do_comes_last_in_the_report(tmp_path):
+    for name in ("acceptance", "squares"):
+        study = Study(name, Options(tmp_path / name), KEY, COLUMNS)
+        study.say(f"Is {name} right?", "Yes.")
+        study.finish()
+    write_report([tmp_path / "acceptance", tmp_path / "squares"], tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert page.index("Is squares right?") < page.index("Is acceptance right?")
+
+
 def test_the_report_is_one_page_without_links_to_elsewhere_and_questions_come_first(tmp_path, capsys):
     study = Study("squares", Options(tmp_path / "squares"), KEY, COLUMNS)
     study.add(KEYS[0], {"seconds": 1.0, "solved": True})
@@ -75,7 +91,9 @@ def test_the_report_is_one_page_without_links_to_elsewhere_and_questions_come_fi
     study.say("All squares", "Numbers.", table=Table(("n < 3", "square"), [(1, 1), (2, 4)]), figure=figure)
     study.say("Which square is largest?", "The last.")
     study.finish()
-    assert "n < 3" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "n < 3" in printed
+    assert "What to look at first:\n- Which square is largest?" in printed
     assert (tmp_path / "squares" / "all_squares.png").stat().st_size > 1000
     assert len(list((tmp_path / "squares").glob("events.out.tfevents.*"))) == 1
     main(["report", str(tmp_path / "squares"), "--output", str(tmp_path / "page.html")])

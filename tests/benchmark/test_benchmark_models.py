@@ -1,4 +1,4 @@
-"""The mode question of LCP Notes 4 on chains that can be counted by hand, and trainings of `benchmark models`."""
+"""The mode question on chains that can be counted by hand, and trainings of `benchmark models`."""
 
 import math
 
@@ -54,7 +54,7 @@ def test_entropies_are_those_of_the_counts():
     assert entropy(BY_HAND, 1) == pytest.approx(pairs)
 
 
-def test_modes_come_back_as_errata_c_found_them():
+def test_a_chain_is_never_right_where_the_mode_changes_and_the_lcp_always_is():
     """A chain of order 1 is right on about 95 % of the steps and never where the mode changes; the LCP always is."""
     data = simulate_modes(seed=0, count=100, steps=500)
     shares = [float((data.mode == mode).double().mean()) for mode in range(3)]

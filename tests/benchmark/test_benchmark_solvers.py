@@ -146,6 +146,15 @@ def test_without_a_peer_its_checks_say_that_they_were_skipped(tmp_path, monkeypa
     assert np.isnan(finding.figure)
 
 
+def test_a_panel_is_left_out_where_nothing_was_measured():
+    from lcplearn.benchmark.acceptance.run import draw_ratios
+
+    row = {"check": speed_checks.AGAINST_INTERIOR_POINT, "case": "F5", "figure": 30.0}
+    peer = {"check": speed_checks.AGAINST_QUANTECON, "case": "F5", "figure": float("nan")}
+    assert len(draw_ratios([row, peer]).axes) == 1
+    assert draw_ratios([peer]) is None
+
+
 def test_acceptance_says_what_is_below_its_floor(tmp_path, capsys, monkeypatch):
     from lcplearn.benchmark.acceptance import run as acceptance
     from lcplearn.benchmark.acceptance.check import Check, Finding

@@ -1,4 +1,4 @@
-"""The noise study of LCP Notes 3.2, the hard cases and the judgement of what methods do with them."""
+"""The noise study, the hard cases and the judgement of what methods do with them."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,7 @@ import torch
 from real_data import real_data
 
 from lcplearn.benchmark.problems.hard_cases import hard_families, published_cases
-from lcplearn.benchmark.solvers import methods as solving
-from lcplearn.benchmark.solvers import peers as methods
+from lcplearn.benchmark.solvers import methods
 from lcplearn.benchmark.solvers.methods import Answer, gradient_error, solve
 from lcplearn.benchmark.stability import noise as noise_study
 from lcplearn.benchmark.stability import run as stability
@@ -39,12 +38,12 @@ def test_without_noise_every_block_sticks(form, push):
         ("structured", "u != 0", 1.0, 1.0),
     ],
 )
-def test_noise_on_all_entries_ends_sticking_where_learning_md_b3_says(form, push, low, high):
+def test_noise_on_all_entries_ends_sticking_where_velocity_comes_from_cancellation(form, push, low, high):
     assert low <= share(form, push, "all") <= high
 
 
-def test_the_traditional_form_survives_noise_on_the_entries_that_b3_names():
-    """Noise on M12 or M21 is harmless for one sign of the push and on q1 or q2 mostly not (errata 27)."""
+def test_the_traditional_form_survives_noise_on_the_entries_that_cancel():
+    """Noise on M12 or M21 is harmless for one sign of the push and on q1 or q2 mostly not."""
     found = {name: share("traditional", "u != 0", str(i)) for i, name in enumerate(noise_study.TRADITIONAL_ENTRIES)}
     assert [found[name] for name in ("M13", "M23", "M31", "M32", "M33", "q3")] == [1] * 6
     assert [found[name] for name in ("M11", "M22", "M12", "M21", "q1", "q2")] == pytest.approx(
@@ -112,9 +111,9 @@ def test_a_solver_that_raises_is_wrong(monkeypatch):
 
 def test_a_peer_that_claims_what_it_has_not_solved_is_wrong_and_one_that_says_so_gives_up(monkeypatch):
     def peer(claims):
-        return lambda M, q: methods.Answer(np.zeros_like(q), np.full(len(q), claims))
+        return lambda M, q: (np.zeros_like(q), np.full(len(q), claims))
 
-    monkeypatch.setattr(solving, "peers", lambda: {"liar": peer(True), "modest": peer(False)})
+    monkeypatch.setattr(methods, "peers", lambda: {"liar": peer(True), "modest": peer(False)})
     assert stability.case_row(CASES[0], "liar")["verdict"] == "wrong"
     assert stability.case_row(CASES[0], "modest")["verdict"] == "gives up"
 

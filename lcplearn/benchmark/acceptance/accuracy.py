@@ -12,7 +12,7 @@ from lcplearn.benchmark.problems import families as problems
 from lcplearn.benchmark.problems.families import Problems
 from lcplearn.benchmark.problems.hard_cases import HardCase, hard_families, published_cases
 from lcplearn.benchmark.solvers.gradients import gradient_errors, reference
-from lcplearn.benchmark.solvers.methods import solve
+from lcplearn.benchmark.solvers.methods import EXACT, SINGLE, equilibrated_residual, solve
 
 CHUNK = 250  # problems that are in memory at once
 Family = Callable[[np.random.Generator, int], Problems]
@@ -57,7 +57,7 @@ def check_family(family: str, options: Options, *, method: str, share: float) ->
     """Worst residual of all, how many are not SOLVED, and how many claim what the residual denies."""
     count = 40 if options.quick else int(share * FULL_COUNT)
     worst, unsolved, wrong = 0.0, 0, 0
-    single = "float32" in method
+    single = method.endswith(SINGLE)
     for M, q, _ in chunks(family, count, options.seed):
         if single:
             M, q = (x.astype(np.float32).astype(np.float64) for x in (M, q))
@@ -65,8 +65,7 @@ def check_family(family: str, options: Options, *, method: str, share: float) ->
         if answer is None:
             return skipped("does not apply")
         claims = np.array([status == "SOLVED" for status in answer.statuses])
-        w = (M @ answer.z[..., None])[..., 0] + q
-        r = np.abs(np.minimum(answer.z, w)).max(1) / (1 + np.abs(q).max(1))
+        r = equilibrated_residual(M, q, answer.z)
         worst = max(worst, float(r[claims].max(initial=0.0)))
         unsolved += int((~claims).sum())
         wrong += int((claims & ~(answer.residual <= 2 * answer.tolerance)).sum())
@@ -151,12 +150,12 @@ _HARD = list(dict.fromkeys(case.family for case in hard_families()))
 CHECKS = (
     Check("families solved by pivoting", "all SOLVED, r <= 1e-10 (mass ratio 1e3: 1e-9), no false status", "",
           "worst r", family_names, partial(check_family, method="pivoting", share=1.0), 6.0),
-    Check("families through interior_point", "never a wrong SOLVED", "all SOLVED", "worst r",
-          family_names, partial(check_family, method="interior_point", share=0.1), 10.0),
+    *(Check(f"families through {name}", "never a wrong SOLVED", "all SOLVED", "worst r",
+            family_names, partial(check_family, method=name, share=0.1), 10.0) for name in EXACT if name != "pivoting"),
     Check("families rounded to float32", "residual at the data's precision, statuses true", "all SOLVED", "worst r",
           family_names, partial(check_family, method="pivoting float32", share=0.2), 3.0),
     Check("published cases", "none wrongly SOLVED", "every solvable one SOLVED to 1e-8 max |q|", "worst r / max |q|",
-          lambda quick: ["pivoting", "interior_point"], check_published, 20.0),
+          lambda quick: list(EXACT), check_published, 20.0),
     Check("hard families, pivoting", "behaves as it should", "", "share right",
           lambda quick: _HARD, partial(check_hard, method="pivoting"), 0.2, True),
     Check("gradients of unique quantities", "median relative error <= 1e-9", "median <= 1e-10, largest <= 1e-6",

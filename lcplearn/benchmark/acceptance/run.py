@@ -50,7 +50,7 @@ def _say(study: Study, options: Options) -> None:
     if missing_peers():
         text += f" {missing_peers()}"
     columns = ("what", "cases", "worst", "must", "met", "goal", "reached")
-    study.say("Does the layer do what it must?", text, table=Table(columns, lines), figure=_draw_ratios(study.rows))
+    study.say("Does the layer do what it must?", text, table=Table(columns, lines), figure=draw_ratios(study.rows))
     for check in CHECKS:
         rows = [row for row in study.rows if row["check"] == check.name]
         cells = [
@@ -70,15 +70,21 @@ def _line(check: Check, rows: Sequence[Row], skipped: int) -> list[Value]:
     return [check.name, cases, f"{show(worst)} {check.unit}", check.must, met, check.goal, goal]
 
 
-def _draw_ratios(rows: Sequence[Row]) -> "Figure":
-    """How many times faster pivoting is than quantecon and than our own interior point, a bar a family."""
+def draw_ratios(rows: Sequence[Row]) -> "Figure | None":
+    """How many times faster pivoting is than quantecon and our interior point, a bar a family; None if not measured."""
     panels = (
         (speed_checks.AGAINST_QUANTECON, "quantecon", (1.0, 1.3)),
         (speed_checks.AGAINST_INTERIOR_POINT, "interior_point", (10.0,)),
     )
-    figure, axes = new_figure(1, 2, width=10.0, height=5.5)
-    for ax, (name, method, lines) in zip(axes[0], panels, strict=True):
-        own = [row for row in rows if row["check"] == name and row["figure"] == row["figure"]]
+    measured = [
+        (own, *panel)
+        for panel in panels
+        if (own := [row for row in rows if row["check"] == panel[0] and row["figure"] == row["figure"]])
+    ]
+    if not measured:
+        return None
+    figure, axes = new_figure(1, len(measured), width=5.0 * len(measured), height=5.5)
+    for ax, (own, _, method, lines) in zip(axes[0], measured, strict=True):
         places = np.arange(len(own))[::-1]
         ax.barh(places, [float(row["figure"]) for row in own], color=STYLES[method].color)
         ax.set_yticks(places, [str(row["case"]) for row in own], fontsize=8)

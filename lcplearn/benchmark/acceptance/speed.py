@@ -15,6 +15,7 @@ from lcplearn.benchmark.overhead import run as overhead
 from lcplearn.benchmark.problems import families as problems
 from lcplearn.benchmark.problems.families import Problems
 from lcplearn.benchmark.solvers.gradients import line
+from lcplearn.benchmark.solvers.methods import PEER_TOLERANCE, equilibrated_residual
 from lcplearn.benchmark.solvers.peers import peers
 from lcplearn.lcp import pivoting
 
@@ -68,8 +69,8 @@ def check_quantecon(family: str, options: Options) -> Finding:
     ratio, low, high = times["quantecon"].over(times["kernel"])
     through_torch, _, _ = times["quantecon"].over(times["torch"])
     microseconds = 1e6 * times["kernel"].cpu / len(q)
-    z = peers()["quantecon"](M, q).z
-    right = np.abs(np.minimum(z, (M @ z[..., None])[..., 0] + q)).max(1) <= 1e-6 * (1 + np.abs(q).max(1))
+    z, _ = peers()["quantecon"](M, q)
+    right = equilibrated_residual(M, q, z) <= PEER_TOLERANCE
     words = (
         f"{low:.2f} to {high:.2f}; through torch {through_torch:.2f}; {microseconds:.3g} us a problem; "
         f"quantecon solves {right.mean():.1%} to 1e-6"

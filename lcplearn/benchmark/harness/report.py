@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import Any
 
 _STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 img { max-width: 100%; }
-table { border-collapse: collapse; font-size: 14px; margin: 1em 0; display: block; overflow-x: auto; }
-td, th { padding: .2em .7em; border-bottom: 1px solid #ddd; text-align: left; white-space: nowrap; }
+table { border-collapse: collapse; font-size: 14px; margin: 1em 0; display: block; overflow-x: auto;
+  /* a shadow at the right edge where a wide table goes on */
+  background: linear-gradient(to left, #fff 30%, #fff0) right / 3rem 100% local no-repeat,
+    linear-gradient(to left, #0003, #0000) right / 1rem 100% scroll no-repeat #fff; }
+td, th { padding: .2em .6em; border-bottom: 1px solid #ddd; text-align: left; }
+td { white-space: nowrap; }
 pre { background: #f5f5f5; padding: .7em; font-size: 12px; overflow-x: auto; } nav a { margin-right: 1em; }
 """
 
 
 def write_report(folders: Iterable[str | Path], output: str | Path) -> None:
-    """Gather the studies of some folders, those that answer a question first.
+    """Gather the studies of some folders: first what answers a question, last whether the layer does what it must.
 
     Folders without a finished study, as that of `fuzz`, are left out with a word.
 
@@ -32,7 +36,7 @@ def write_report(folders: Iterable[str | Path], output: str | Path) -> None:
     for folder in paths:
         if folder not in finished:
             sys.stderr.write(f"left out, as it holds no finished study: {folder}\n")
-    studies = [_read(folder) for folder in finished]
+    studies = sorted((_read(folder) for folder in finished), key=lambda study: study[1]["name"] == "acceptance")
     questions, chapters = [], []
     for folder, study in studies:
         sections = study["sections"]

@@ -133,7 +133,7 @@ class Study:
         self._sections.append(section)
 
     def finish(self) -> None:
-        """Write summary.json and the TensorBoard run."""
+        """Write summary.json and the TensorBoard run; say what to look at."""
         from torch.utils.tensorboard import SummaryWriter
 
         summary = {"name": self.name, "settings": self._settings, "sections": self._sections}
@@ -145,6 +145,12 @@ class Study:
                 writer.add_figure(f"{self.name}/{name}", figure, close=False)
             for section in self._sections:
                 writer.add_text(f"{self.name}/{section['heading']}", str(section["text"]) or "-")
+        print("\nWhat to look at first:")
+        for section in self._sections:
+            if str(section["heading"]).endswith("?"):
+                picture = f"  ({self.folder / str(section['figure'])})" if "figure" in section else ""
+                print(f"- {section['heading']}{picture}")
+        print(f"All on one page: python -m lcplearn.benchmark report {self.folder}")
 
     def _done(self) -> set[tuple[str, ...]]:
         return {self._text([row[name] for name in self.key]) for row in self.rows}
@@ -194,7 +200,7 @@ def read_rows(path: str | Path) -> list[Row]:
 
 def format_table(table: Table) -> str:
     """A markdown table, its columns aligned: text to the left, numbers to the right."""
-    cells = [[show(cell) for cell in row] for row in (table.columns, *table.rows)]
+    cells = [[show(cell).replace("|", "\\|") for cell in row] for row in (table.columns, *table.rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(table.columns))]
     text = [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
 
@@ -211,6 +217,7 @@ def show(value: Value) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
+        value += 0.0  # no -0
         return "" if value != value else f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
     return str(value)
 

@@ -43,7 +43,7 @@ def chain(modes: Int[Tensor, "N T"], order: int) -> Float[Tensor, "..."]:
     Returns:
         Probabilities, [MODES] * (order + 1); histories that never occurred are uniform.
 
-    Source: LCP Notes 4; errata C.
+    Source: Pfrommer, LCP Notes (2019), section 4.
     """
     columns = [modes[:, order - k : modes.shape[1] - k] for k in range(order, -1, -1)]
     index = sum(column * MODES ** (order - i) for i, column in enumerate(columns))

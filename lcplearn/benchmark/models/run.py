@@ -197,12 +197,19 @@ def _report_modes(study: Study, shown: Sequence[Row]) -> None:
          median(own, "entropy_bits"))
         for part, name, own, exact, nearly in entries
     ]  # fmt: skip
-    heads = ("modes", "model", "all steps", "at changes", "all, |v| < 0.01", "at changes, |v| < 0.01", "entropy [bits]")
+    heads = (
+        "modes",
+        "model",
+        "all steps",
+        "at changes",
+        "all, |v| < 0.01",
+        "at changes, |v| < 0.01",
+        "entropy [bits]",
+    )
     study.say(
         "Can a Markov chain foretell stick and slip?",
         "Share of modes foretold one step ahead: of all steps, and of those where the mode changes. Learned models "
-        "(noise 0.01 m/s, 1000 steps) see velocity and force, chains only the modes before, of the true motion. "
-        "Errata C measured 95.1 % and 0 % for a chain of order 1 with separation, and entropies 1.44, 0.31, 0.31 bits.",
+        "(noise 0.01 m/s, 1000 steps) see velocity and force, chains only the modes before, of the true motion.",
         table=Table(heads, table),
         figure=model_figures.mode_bars(table),
     )

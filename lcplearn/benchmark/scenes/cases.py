@@ -4,11 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.benchmark.scenes.full_block import FULL_ROWS, full_velocity
+from lcplearn.benchmark.problems.families import stewart_trinkle
+from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes import BouncingBlock, FallingBlock, Mode, OneWayBlock, SlidingBlock
 from lcplearn.scenes.rollout import Block
 
@@ -17,6 +19,28 @@ SPEED, HEIGHT, DURATION = 2.0, 1.0, 1.0  # [m/s], [m], [s]: slides 0.51 m to res
 
 State = Float[Tensor, "B 2"]
 Step = Callable[[State], State]
+
+
+def _full_matrix() -> Tensor:
+    """M of the LCP that does not look at what a scene needs: normal, two friction directions, slip speed."""
+    up, along = np.array([[[1.0, 0.0]]]), np.array([[[0.0, 1.0], [0.0, -1.0]]])
+    problem = stewart_trinkle(np.eye(2)[None] / MASS, up, along, np.array([[MU]]), np.zeros((1, 2)))
+    return torch.from_numpy(problem.M[0])
+
+
+FULL = _full_matrix()
+
+
+def full_velocity(normal: Float[Tensor, " B"], sideways: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
+    """Change of the normal velocity by contact, and the velocity along the ground after the step [m/s].
+
+    normal is the velocity with which the gap would open, v_n + gap / dt (or v_n + e v_n before), sideways that along
+    the ground without friction. Like `SlidingBlock`'s traditional form, the latter is held to |v| <= gamma, so that
+    sticking is exact.
+    """
+    z = solve_lcp(FULL, torch.stack((normal, sideways, -sideways, torch.zeros_like(normal)), dim=-1)).z
+    slip = sideways + (z[..., 1] - z[..., 2]) / MASS
+    return z[..., 0] / MASS, torch.minimum(torch.maximum(slip, -z[..., 3]), z[..., 3])
 
 
 class Formulation(NamedTuple):
@@ -48,7 +72,7 @@ class _FullBlock(Block):
 
 
 def _full(move: Callable[[State, float], State]) -> Formulation:
-    return Formulation(FULL_ROWS, _stepper(lambda dt: _FullBlock(move, dt)))
+    return Formulation(len(FULL), _stepper(lambda dt: _FullBlock(move, dt)))
 
 
 def _sliding(form: str) -> Callable[[float], Step]:
@@ -70,7 +94,7 @@ def _slide_closed(make: Callable[[float], Any]) -> Callable[[float], Step]:
 
 def _slide_full(state: State, dt: float) -> State:
     down = torch.full_like(state[:, 1], -GRAVITY * dt)  # rests on the ground, gap 0
-    _, velocity = full_velocity(down, state[:, 1], mass=MASS, mu=MU)
+    _, velocity = full_velocity(down, state[:, 1])
     return torch.stack((state[:, 0] + dt * velocity, velocity), dim=-1)
 
 
@@ -88,7 +112,7 @@ def _fall_closed(dt: float) -> Step:
 def _fall_full(state: State, dt: float) -> State:
     gap, velocity = state.unbind(-1)
     free = velocity - GRAVITY * dt
-    change, _ = full_velocity(free + gap / dt, torch.zeros_like(gap), mass=MASS, mu=MU)
+    change, _ = full_velocity(free + gap / dt, torch.zeros_like(gap))
     return torch.stack((gap + dt * (free + change), free + change), dim=-1)
 
 
@@ -106,7 +130,7 @@ def _bounce_closed(dt: float) -> Step:
 def _bounce_full(state: State, dt: float) -> State:
     gap, velocity = state.unbind(-1)
     free = velocity - GRAVITY * dt
-    change, _ = full_velocity(free + RESTITUTION * velocity, torch.zeros_like(gap), mass=MASS, mu=MU)
+    change, _ = full_velocity(free + RESTITUTION * velocity, torch.zeros_like(gap))
     after = free + torch.where(gap + dt * velocity <= 0, change, 0.0)
     return torch.stack((gap + dt * after, after), dim=-1)
 
@@ -145,7 +169,7 @@ def random_states(scene: str, count: int, seed: int) -> State:
     if scene in ("falling block", "bouncing block"):
         touches = torch.arange(count) % 3 == 0
         return torch.stack((torch.where(touches, 0.0, 0.02 * x), v * (torch.arange(count) % 4 > 0)), dim=-1)
-    if scene == "one-way block":  # nothing pushes it backwards (Remark 1)
+    if scene == "one-way block":  # nothing pushes it backwards (NOTES.md, section 5.3)
         v = v.abs()
     slow = torch.where(torch.arange(count) % 2 == 0, 0.05, 1.0)
     return torch.stack((x, v * slow * (torch.arange(count) % 5 > 0)), dim=-1)

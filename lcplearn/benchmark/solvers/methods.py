@@ -11,15 +11,20 @@ from lcplearn.lcp.residuals import TINY, default_tolerance, equilibrate, judge, 
 from lcplearn.lcp.solution import Status
 from lcplearn.lcp.solve import solve_lcp
 
-SMOOTHED = "smoothed 1e-8"  # z_i w_i = 1e-8: biased on purpose, judged as the problem that it is
-OURS: dict[str, tuple[dict[str, Any], torch.dtype]] = {
-    "pivoting": ({"method": "pivoting"}, torch.float64),
-    "interior_point": ({"method": "interior_point"}, torch.float64),
-    SMOOTHED: ({"smoothing": 1e-8}, torch.float64),
-    "diagonal": ({"method": "diagonal"}, torch.float64),
-    "pivoting float32": ({"method": "pivoting"}, torch.float32),
-    "interior_point float32": ({"method": "interior_point"}, torch.float32),
+# Keywords of `solve_lcp`. A new method is one entry: checks, tests and benchmarks go through this table.
+# The interior point ends on a basis, to rounding; stopped at a coarser tolerance it is the smoothed solution of
+# that complementarity.
+METHODS: dict[str, dict[str, Any]] = {
+    "pivoting": {"method": "pivoting"},
+    "interior_point": {"method": "interior_point"},
+    "smoothed 1e-10": {"smoothing": 1e-10},
+    "smoothed 1e-7": {"smoothing": 1e-7},
+    "smoothed 1e-4": {"smoothing": 1e-4},
+    "diagonal": {"method": "diagonal"},
 }
+EXACT = tuple(name for name, keywords in METHODS.items() if "smoothing" not in keywords and name != "diagonal")
+SINGLE = " float32"  # after the name of a method: the same on data and solutions of that precision
+PEER_TOLERANCE = 1e-6  # what peers claim to be solved may be this far off
 
 
 class Answer(NamedTuple):
@@ -38,13 +43,23 @@ class Answer(NamedTuple):
     tolerance: np.ndarray
 
 
-PEER_TOLERANCE = 1e-6  # what they claim to be solved may be this far off
+def all_methods() -> tuple[str, ...]:
+    """Ours, the exact ones in float32 too, and installed peers."""
+    return (*METHODS, *(name + SINGLE for name in EXACT), *peers())
 
-METHODS: tuple[str, ...] = (*OURS, *peers())
+
+def keywords_of(method: str) -> tuple[dict[str, Any], torch.dtype]:
+    """Keywords of `solve_lcp` and precision of a method of ours."""
+    return METHODS[method.removesuffix(SINGLE)], torch.float32 if method.endswith(SINGLE) else torch.float64
+
+
+def applies(method: str, M: np.ndarray) -> bool:
+    """Whether a method is meant for such M: the diagonal one only if they are diagonal."""
+    return not method.startswith("diagonal") or not np.where(np.eye(M.shape[-1]) == 1, 0, M).any()
 
 
 def solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
-    """Solve B problems M [B, n, n], q [B, n] by one of `METHODS`; None if it doesn't apply.
+    """Solve B problems M [B, n, n], q [B, n] by one of `all_methods`; None if it doesn't apply.
 
     What raises has the status "RAISED" with the error's name: no numbers should make a solver do that.
     """
@@ -59,11 +74,11 @@ def _solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
     if method in peers():
         if q.shape[1] == 0:
             return None
-        found = peers()[method](M, q)
-        statuses = ["SOLVED" if claim else "UNSOLVED" for claim in found.claimed]
-        return Answer(found.z, statuses, equilibrated_residual(M, q, found.z), np.full(len(q), PEER_TOLERANCE))
-    keywords, dtype = OURS[method]
-    if method == "diagonal" and np.where(np.eye(M.shape[-1]) == 1, 0, M).any():
+        z, claimed = peers()[method](M, q)
+        statuses = ["SOLVED" if claim else "UNSOLVED" for claim in claimed]
+        return Answer(z, statuses, equilibrated_residual(M, q, z), np.full(len(q), PEER_TOLERANCE))
+    keywords, dtype = keywords_of(method)
+    if not applies(method, M):
         return None
     with np.errstate(over="ignore"):
         data = [torch.from_numpy(np.ascontiguousarray(x)).to(dtype) for x in (M, q)]
@@ -74,9 +89,14 @@ def _solve(method: str, M: np.ndarray, q: np.ndarray) -> Answer | None:
 
 
 def equilibrated_residual(M: np.ndarray, q: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Part (a) of our residual alone: max |min(z, w)| / max |q| in units in which M has entries of size 1; inf for NaN.
+    """The residual by which methods are compared, part (a) of our own; inf for NaN.
+
+    max |min(z, w)| / max |q| in units in which M has entries of size 1.
 
     Part (b) asks for the sign of rounding noise, of which peers promise nothing.
+
+    Returns:
+        [B].
     """
     data, offset, point = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M, q, z))
     d = equilibrate(data)
@@ -114,9 +134,9 @@ def gradient_error(method: str, M: np.ndarray, q: np.ndarray, read: np.ndarray |
         The error over the larger derivative. NaN if nothing is unique, or if neither side has a derivative that two
         step sizes agree about.
     """
-    if method not in OURS or len(q) == 0 or (read is None and not symmetric):
+    if method in peers() or len(q) == 0 or (read is None and not symmetric):
         return float("nan")
-    keywords, dtype = OURS[method]
+    keywords, dtype = keywords_of(method)
     start = solve_lcp(torch.from_numpy(np.array(M)), torch.from_numpy(np.array(q)), **keywords)
     z, w = start.z.numpy(), start.w.numpy()
     rng = np.random.default_rng(0)

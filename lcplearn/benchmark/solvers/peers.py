@@ -1,36 +1,18 @@
-"""The solvers that are compared: ours by their keywords, and the peers that are installed."""
+"""Solvers of other packages, those that are installed. A further one is one function in `peers`."""
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-# Keywords of `solve_lcp`. The interior point ends on a basis, to rounding; stopped at a coarser tolerance it is the
-# smoothed solution of that complementarity.
-METHODS: dict[str, dict[str, Any]] = {
-    "pivoting": {"method": "pivoting"},
-    "interior_point": {"method": "interior_point"},
-    "smoothed 1e-10": {"smoothing": 1e-10},
-    "smoothed 1e-7": {"smoothing": 1e-7},
-    "smoothed 1e-4": {"smoothing": 1e-4},
-    "diagonal": {"method": "diagonal"},
-}
-
-
-class Answer(NamedTuple):
-    """What a peer returns: z [B, n], and which elements it claims to have solved [B]."""
-
-    z: np.ndarray
-    claimed: np.ndarray
-
-
-Peer = Callable[[np.ndarray, np.ndarray], Answer]
+# float64 M [B, n, n] and q [B, n] to z [B, n] and which elements it claims to have solved [B].
+Peer = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @cache
 def peers() -> dict[str, Peer]:
-    """Other packages' solvers by name, those that are installed; each takes float64 M [B, n, n] and q [B, n]."""
+    """Other packages' solvers by name, those that are installed."""
     try:
         return {"quantecon": _quantecon()}
     except ImportError:
@@ -54,9 +36,9 @@ def _quantecon() -> Peer:
         for b in range(len(q)):
             claimed[b] = lcp_lemke(M[b], q[b], tableau=tableau, basis=basis, z=z[b]).success
 
-    def solve(M: np.ndarray, q: np.ndarray) -> Answer:
-        answer = Answer(np.empty(q.shape), np.empty(len(q), dtype=np.bool_))
-        loop(np.ascontiguousarray(M, np.float64), np.ascontiguousarray(q, np.float64), *answer)
-        return answer
+    def solve(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        z, claimed = np.empty(q.shape), np.empty(len(q), dtype=np.bool_)
+        loop(np.ascontiguousarray(M, np.float64), np.ascontiguousarray(q, np.float64), z, claimed)
+        return z, claimed
 
     return solve

@@ -25,7 +25,8 @@ from lcplearn.benchmark.solvers.figures import (
     draw_work_precision,
 )
 from lcplearn.benchmark.solvers.gradients import Reference, gradient_errors, reference
-from lcplearn.benchmark.solvers.peers import METHODS, missing_peers, peers
+from lcplearn.benchmark.solvers.methods import METHODS, applies, equilibrated_residual
+from lcplearn.benchmark.solvers.peers import missing_peers, peers
 from lcplearn.lcp.residuals import default_tolerance
 
 Family = Callable[[np.random.Generator, int], Problems]
@@ -131,9 +132,8 @@ def _calls(data: Problems, dtype: torch.dtype, longest: float) -> Calls:
     """Each call has run once, so that nothing is left to compile or allocate."""
     calls = Calls({}, {}, {})
     M, q = torch.from_numpy(data.M).to(dtype), torch.from_numpy(data.q).to(dtype)
-    diagonal = bool((data.M * np.eye(data.M.shape[-1]) == data.M).all())
     for name, keywords in METHODS.items():
-        if name == "diagonal" and not diagonal:
+        if not applies(name, data.M):
             continue
         few, some = (partial(solve_lcp, M[:count], q[:count], **keywords) for count in (FEW, SOME))
         fixed, more = _seconds(few), _seconds(some)
@@ -149,19 +149,18 @@ def _calls(data: Problems, dtype: torch.dtype, longest: float) -> Calls:
     for name, peer in peers().items():
         call = partial(peer, data.M, data.q)
         began = time.perf_counter()
-        answer = call()
+        found, _ = call()
         if time.perf_counter() - began < longest + COMPILATION:  # a peer may cycle for minutes
-            calls.forward[name], calls.z[name] = call, torch.from_numpy(answer.z)
+            calls.forward[name], calls.z[name] = call, torch.from_numpy(found)
     return calls
 
 
 def _residuals(data: Problems, z: Tensor, tolerance: float) -> dict[str, float]:
-    M, q = torch.from_numpy(data.M), torch.from_numpy(data.q)
-    natural = torch.minimum(z, (M @ z[..., None])[..., 0] + q).abs().amax(-1) / (1 + q.abs().amax(-1))
+    residual = equilibrated_residual(data.M, data.q, z.numpy())
     return {
-        "residual": float(natural.median()),
-        "worst_residual": float(natural.max()),
-        "solved": float((natural <= tolerance).double().mean()),
+        "residual": float(np.median(residual)),
+        "worst_residual": float(residual.max()),
+        "solved": float((residual <= tolerance).mean()),
     }
 
 
@@ -192,8 +191,9 @@ def _say(study: Study, batch: int) -> None:
     double = [row for row in at_batch if row["precision"] == "float64"]
     study.say(
         "Which solver is fastest for the accuracy I need?",
-        f"{_speed(double)} Residuals max |min(z, w)| / (1 + max |q|) are recomputed from the data; bars are quartiles "
-        f"over repeats; CPU time of a problem in a batch of {batch}. Hollow: fewer than 99 % of the problems solved. "
+        f"{_speed(double)} Residuals max of min(z, w) over max of q, in units in which M has entries of size 1, "
+        f"are recomputed from the data; bars are quartiles over repeats; CPU time of a problem in "
+        f"a batch of {batch}. Hollow: fewer than 99 % of the problems solved. "
         f"Left out, as a call takes more than {LONGEST:g} s: {_left_out(study.rows)}.",
         figure=draw_work_precision(double),
     )

@@ -1,4 +1,4 @@
-"""Does a block that should stick still stick when its LCP is perturbed? The lost noise study of LCP Notes 3.2."""
+"""Does a block that should stick still stick when its LCP is perturbed? From the LCP Notes (2019), 3.2."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -79,7 +79,7 @@ def traditional_bounded(generator: Generator, force: Tensor, sigma: float, entri
 
 
 def _slack_parts(force: Tensor) -> tuple[Tensor, Tensor]:
-    """f(v, u) = (p - c, -p - c) and G = I of the notes' 3.1.2."""
+    """f(v, u) = (p - c, -p - c) and G = I: the slack form (NOTES.md, section 6.2)."""
     return torch.stack((force - LIMIT, -force - LIMIT), dim=-1), torch.eye(2, dtype=force.dtype)
 
 
@@ -148,7 +148,7 @@ def stick_share(form: str, push: str, entries: str, sigma: float, *, samples: in
     Returns:
         Shares: sticks (|v| < 1e-12 m/s), nearly_sticks (|v| < 1e-3 m/s), solved.
 
-    Source: LCP Notes 3.2; errata 27.
+    Source: Pfrommer, LCP Notes (2019), section 3.2; NOTES.md, section 8.
     """
     generator = torch.Generator().manual_seed(seed)
     size = 0.1 + 0.8 * torch.rand(samples, generator=generator, dtype=torch.float64)

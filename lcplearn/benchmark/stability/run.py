@@ -8,7 +8,7 @@ import numpy as np
 
 from lcplearn.benchmark.harness.study import Options, Row, Study, Table
 from lcplearn.benchmark.problems.hard_cases import HardCase, hard_families, published_cases
-from lcplearn.benchmark.solvers.methods import METHODS, SMOOTHED, Answer, gradient_error, solve
+from lcplearn.benchmark.solvers.methods import Answer, all_methods, gradient_error, solve
 from lcplearn.benchmark.stability import figures as stability_figures
 from lcplearn.benchmark.stability import noise as noise_study
 from lcplearn.benchmark.stability.sweeps import SWEEPS, sweep
@@ -51,8 +51,8 @@ def run(options: Options) -> None:
 
 
 def plan(cases: Sequence[HardCase], quick: bool) -> Iterable[tuple[Any, ...]]:
-    """Keys of all rows; a quick run leaves out the smoothed solver, the slowest."""
-    methods = [method for method in METHODS if not (quick and method == SMOOTHED)]
+    """Keys of all rows; a quick run leaves out smoothed solutions, the slowest."""
+    methods = [method for method in all_methods() if not (quick and method.startswith("smoothed"))]
     for case in cases:
         yield from (("case", case.family, case.name, len(case.q), method) for method in methods)
     for name, values in SWEEPS.items():
@@ -156,7 +156,7 @@ def report(study: Study, left_out: str) -> None:
     """Tables and figures."""
     cases = [row for row in study.rows if row["part"] == "case" and row["verdict"] != ""]
     counts = Counter((row["method"], row["verdict"]) for row in cases)
-    methods = [method for method in METHODS if any(row["method"] == method for row in cases)]
+    methods = [method for method in all_methods() if any(row["method"] == method for row in cases)]
     wrong = ", ".join(f"{counts[method, 'wrong']} by {method}" for method in methods if counts[method, "wrong"])
     study.say(
         "Which method survives hard problems?",
