@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from lcplearn.lcp.solve import solve_lcp
     from lcplearn.training.checkpoint import load
 
+__version__ = "0.1.0"
 __all__ = ["LCPError", "LCPLayer", "LCPSolution", "Status", "load", "solve_lcp"]
 
 _HOMES = {
@@ -27,3 +28,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'lcplearn' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)
     return value
+
+
+def __dir__() -> list[str]:
+    return ["__version__", *__all__]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
 from lcplearn.lcp.gradient import adjoint, batch_inputs
-from lcplearn.lcp.methods import Options, solve
+from lcplearn.lcp.methods import Options, pivots, solve
 from lcplearn.lcp.solution import LCPSolution
 
 FIELDS = len(LCPSolution._fields)
@@ -64,15 +64,12 @@ def _adjoint(
     grad_z: Tensor | None,
     grad_w: Tensor | None,
     need_M: bool,
-    method: str,
-    tol: float,
-    max_iter: int | None,
     smoothing: float,
+    in_kernel: bool,
 ) -> tuple[Tensor, Tensor]:
     del q  # an argument so that torch knows that the backward depends on it, and refuses to differentiate it silently
     with torch.no_grad():
-        options = Options(method, tol, max_iter, smoothing)
-        grad_M, grad_q = adjoint((M, z, w, basis, status), grad_z, grad_w, need_M, options)
+        grad_M, grad_q = adjoint((M, z, w, basis, status), grad_z, grad_w, need_M, smoothing, in_kernel)
         return M.new_empty(0) if grad_M is None else grad_M, grad_q
 
 
@@ -83,7 +80,8 @@ def _(M: Tensor, q: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    M, q, _, *ctx.options = inputs
+    M, q, _, *options = inputs
+    ctx.smoothing, ctx.in_kernel = options[-1], pivots(q, Options(*options))
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(M, q, *output[:4])
 
@@ -92,7 +90,7 @@ def _backward(ctx: Any, grad_z: Tensor | None, grad_w: Tensor | None, *_: Any) -
     grad_M = grad_q = None
     if grad_z is not None or grad_w is not None:
         need_M, need_q, *_ = ctx.needs_input_grad
-        grad_M, grad_q = _adjoint(*ctx.saved_tensors, grad_z, grad_w, need_M, *ctx.options)
+        grad_M, grad_q = _adjoint(*ctx.saved_tensors, grad_z, grad_w, need_M, ctx.smoothing, ctx.in_kernel)
         grad_M, grad_q = grad_M if need_M else None, grad_q if need_q else None
     return grad_M, grad_q, *(None,) * 5
 

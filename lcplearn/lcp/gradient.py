@@ -22,15 +22,16 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from lcplearn.lcp.methods import Options, pivoting_kernel, pivots, plain, solve, traced
-from lcplearn.lcp.residuals import multiply, two_sided_scales
+from lcplearn.lcp.methods import Options, pivoting_kernel, pivots, plain, solve
+from lcplearn.lcp.residuals import EPS, multiply, two_sided_scales
 from lcplearn.lcp.solution import LCPSolution, Status
+from lcplearn.lcp.torch_internals import forward_mode, mapped_by_autograd, traced, transformed
 
-# By precision of the data: pivots below the first (times n) call a block singular, singular values below the second
-# are dropped. Rank-deficient contact matrices rounded to float32 are full rank at 1e-7 only by rounding.
-RANK_TOLERANCES = {torch.float64: (1e-15, 1e-9), torch.float32: (1e-7, 1e-5)}
+# By precision of the data: pivots below the first (times n) call a block singular; of one that is, what is below the
+# second is dropped (here singular values, in the kernel pivots of its complete pivoting). Rank-deficient contact
+# matrices rounded to float32 are full rank at 1e-7 only by rounding.
+RANK_TOLERANCES = {torch.float64: (EPS, 1e-11), torch.float32: (1e-7, 1e-5)}
 
 
 def differentiable_solve(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:
@@ -38,8 +39,10 @@ def differentiable_solve(M: Tensor, q: Tensor, initial_basis: Tensor | None, opt
 
     M is [*batch, n, n], or [n, n] shared by the batch of q [*batch, n]; its gradient is then the sum over the batch.
     """
-    if torch._C._are_functorch_transforms_active():
+    if transformed():
         return LCPSolution(*_TransformableSolve.apply(M, q, initial_basis, options))
+    if not ((torch.is_grad_enabled() and (M.requires_grad or q.requires_grad)) or forward_mode()):
+        return solve(M, q, initial_basis, options)  # an autograd.Function takes longer than a small solve
     z, w, solution = _EagerSolve.apply(M, q, initial_basis, options)
     return LCPSolution(z, w, *solution[2:])
 
@@ -58,12 +61,12 @@ class _EagerSolve(torch.autograd.Function):
         if grad_z is None and grad_w is None:
             return None, None, None, None
         need_M, need_q, *_ = ctx.needs_input_grad
-        grad_M, grad_q = adjoint(ctx.saved_tensors, grad_z, grad_w, need_M, ctx.options)
+        grad_M, grad_q = adjoint(ctx.saved_tensors, grad_z, grad_w, need_M, ctx.smoothing, ctx.in_kernel)
         return grad_M, grad_q if need_q else None, None, None
 
     @staticmethod
     def jvp(ctx: Any, dM: Tensor | None, dq: Tensor | None, *_: Any) -> Any:
-        return *tangent(ctx.saved_tensors, dM, dq, ctx.options), None
+        return *tangent(ctx.saved_tensors, dM, dq, ctx.smoothing), None
 
 
 class _TransformableSolve(torch.autograd.Function):
@@ -85,7 +88,7 @@ class _TransformableSolve(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, dM: Tensor | None, dq: Tensor | None, *_: Any) -> Any:
-        return *tangent(ctx.saved_tensors, dM, dq, ctx.options), *(None,) * (len(LCPSolution._fields) - 2)
+        return *tangent(ctx.saved_tensors, dM, dq, ctx.smoothing), *(None,) * (len(LCPSolution._fields) - 2)
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *inputs: Any) -> Any:
@@ -96,7 +99,7 @@ class _TransformableSolve(torch.autograd.Function):
 def _save(ctx: Any, M: Tensor, solution: LCPSolution, options: Options) -> None:
     z, w, basis, status, *_ = solution
     saved = M, z, w, basis, status
-    ctx.options = options
+    ctx.smoothing, ctx.in_kernel = options.smoothing, pivots(z, options)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*saved)
     ctx.save_for_forward(*saved)
@@ -117,15 +120,20 @@ def batch_inputs(
 
 
 def adjoint(
-    saved: tuple[Tensor, ...], grad_z: Tensor | None, grad_w: Tensor | None, need_M: bool, options: Options
+    saved: tuple[Tensor, ...],
+    grad_z: Tensor | None,
+    grad_w: Tensor | None,
+    need_M: bool,
+    smoothing: float,
+    in_kernel: bool,
 ) -> tuple[Tensor | None, Tensor]:
     """Gradients with respect to M (or None) and q from those with respect to z and w (None is zero).
 
-    `saved` holds M, z, w, basis and status.
+    `saved` holds M, z, w, basis and status; `in_kernel` asks for the kernel's adjoint wherever it can be used.
     """
     M, z, w, basis, status = saved
     basis, status = basis.bool(), status.long()  # hooks on saved tensors may give back others
-    if pivots(z, options) and not _differentiated(grad_z, grad_w):
+    if in_kernel and not _differentiated(grad_z, grad_w):
         return _adjoint_in_kernel(M, z, basis, status, grad_z, grad_w, need_M)
     grad_z = torch.zeros_like(z) if grad_z is None else grad_z
     grad_w = torch.zeros_like(w) if grad_w is None else grad_w
@@ -133,12 +141,12 @@ def adjoint(
     M, z, w, grad_z, grad_w = (x.double() for x in (M, z, w, grad_z, grad_w))
     solved = (status == Status.SOLVED).unsqueeze(-1)
     g_z, g_w, z = (torch.where(solved, x, 0.0) for x in (grad_z, grad_w, z))
-    if options.smoothing:
+    if smoothing:
         basis, damping = _damping(z, w, basis & solved)
     h_I = torch.where(basis, 0.0, g_w)
     rhs = -g_z - multiply(M.mT, h_I)
     K = M.mT
-    if options.smoothing:
+    if smoothing:
         K, rhs = K + torch.diag_embed(damping), rhs + damping * g_w
     grad_q = torch.where(basis, _solve_on_basis(K, basis & solved, rhs, dtype), h_I)
     grad_M = (grad_q.unsqueeze(-1) * z.unsqueeze(-2)).sum_to_size(M.shape).to(dtype) if need_M else None
@@ -147,12 +155,9 @@ def adjoint(
 
 def _differentiated(grad_z: Tensor | None, grad_w: Tensor | None) -> bool:
     """Whether somebody differentiates, maps or traces the backward: then it has to be made of torch's operations."""
-    if torch.is_grad_enabled() or forward_ad._current_level >= 0 or traced():
+    if torch.is_grad_enabled() or forward_mode() or traced() or transformed():
         return True
-    if torch._C._are_functorch_transforms_active():
-        return True
-    mapped = torch._C._functorch.is_legacy_batchedtensor
-    return (grad_z is not None and mapped(grad_z)) or (grad_w is not None and mapped(grad_w))
+    return any(x is not None and mapped_by_autograd(x) for x in (grad_z, grad_w))
 
 
 def _adjoint_in_kernel(
@@ -181,7 +186,7 @@ def _adjoint_in_kernel(
     return None if grad_M is None else grad_M.float(), grad_q.float()
 
 
-def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, options: Options) -> tuple[Tensor, Tensor]:
+def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, smoothing: float) -> tuple[Tensor, Tensor]:
     """Directional derivatives of z and w along dM and dq (None is zero)."""
     M, z, w, basis, status = saved
     dtype = z.dtype
@@ -192,12 +197,12 @@ def tangent(saved: tuple[Tensor, ...], dM: Tensor | None, dq: Tensor | None, opt
     if dM is not None:
         e = e + torch.where(solved, multiply(dM.double(), z), 0.0)
     K = M
-    if options.smoothing:
+    if smoothing:
         basis, damping = _damping(z, w, basis & solved)
         K = M + torch.diag_embed(damping)
     dz = _solve_on_basis(K, basis & solved, -e, dtype)
     dw = e + multiply(M, dz)
-    if not options.smoothing:
+    if not smoothing:
         dw = torch.where(basis, 0.0, dw)
     return dz.to(dtype), torch.where(solved, dw, 0.0).to(dtype)
 

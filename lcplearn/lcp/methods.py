@@ -13,9 +13,6 @@ from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, interior_poin
 from lcplearn.lcp.residuals import judge
 from lcplearn.lcp.solution import LCPSolution, Status
 
-MODES = torch._C._TorchDispatchModeKey
-PRE_DISPATCH = torch._C.DispatchKey.PreDispatch  # make_fx(pre_dispatch=True) and export trace there
-
 Method = Literal["auto", "diagonal", "pivoting", "interior_point"]
 
 
@@ -26,17 +23,6 @@ class Options(NamedTuple):
     tol: float
     max_iter: int | None
     smoothing: float
-
-
-def traced() -> bool:
-    """Whether a tracer records what is done (compile, export, make_fx) or makes fake tensors: numba can't be traced.
-
-    Other modes of torch's dispatcher only watch.
-    """
-    if torch.compiler.is_compiling() or torch._C._dispatch_tls_is_dispatch_key_included(PRE_DISPATCH):
-        return True
-    mode = torch._C._get_dispatch_mode
-    return torch._C._len_torch_dispatch_stack() > 0 and not (mode(MODES.PROXY) is mode(MODES.FAKE) is None)
 
 
 def solve(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) -> LCPSolution:

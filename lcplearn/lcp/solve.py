@@ -9,9 +9,10 @@ from torch import Tensor
 
 from lcplearn.lcp.compiled import traced_solve
 from lcplearn.lcp.gradient import differentiable_solve
-from lcplearn.lcp.methods import Method, Options, traced
+from lcplearn.lcp.methods import Method, Options
 from lcplearn.lcp.residuals import default_tolerance
 from lcplearn.lcp.solution import LCPSolution
+from lcplearn.lcp.torch_internals import traced
 
 DTYPES = frozenset((torch.float32, torch.float64))
 

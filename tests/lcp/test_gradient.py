@@ -8,6 +8,7 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from lcplearn import solve_lcp
 from lcplearn.benchmark.problems.families import stacked_cubes
+from lcplearn.lcp.gradient import adjoint
 
 METHODS = ("pivoting", "interior_point")
 FRICTION = [[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]]  # notes 2.5 with mass = dt = 1
@@ -300,3 +301,17 @@ def test_blocks_that_are_not_finite_spoil_no_neighbour():
     (expected,) = torch.autograd.grad(solve_lcp(M[1], alone, method="interior_point").z.square().sum(), alone)
     assert gradient.isfinite().all()
     torch.testing.assert_close(gradient[1], expected)
+
+
+@pytest.mark.parametrize(("gap", "singular"), [(1e-9, False), (8.9e-16, False), (2.3e-16, True), (0.0, True)])
+def test_kernel_and_torch_agree_on_which_blocks_are_singular(gap, singular):
+    """The pivots of [[1, 1], [1, 1 + gap]] are 1 and gap; the smaller one shows in what its inverse would blow up."""
+    M = torch.tensor([[1.0, 1.0], [1.0, 1.0 + gap]])
+    saved = M, torch.ones(2), torch.zeros(2), torch.ones(2, dtype=torch.bool), torch.tensor(0)
+    for grad_z, bounded in (([1.0, -1.0], singular), ([1.0, 1.0], True)):
+        with torch.no_grad():
+            found = [
+                adjoint(saved, torch.tensor(grad_z), None, False, 0.0, in_kernel)[1] for in_kernel in (True, False)
+            ]
+        for grad_q in found:
+            assert (grad_q.abs().max() < 3) == bounded

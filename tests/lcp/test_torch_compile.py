@@ -100,12 +100,12 @@ def test_second_derivatives_in_compiled_code_raise():
 @pytest.mark.parametrize("shared", [False, True])
 def test_operators_pass_the_operator_check_of_torch(shared):
     M, q = problem(shared)
-    for options in (("auto", 1e-10, None, 0.0), ("interior_point", 1e-10, 50, 1e-3)):
+    for in_kernel, options in ((True, ("auto", 1e-10, None, 0.0)), (False, ("interior_point", 1e-10, 50, 1e-3))):
         torch.library.opcheck(torch.ops.lcplearn.solve.default, (M, q, None, *options))
         saved = [x.detach() for x in (M, *solve_lcp(M, q)[:4])]
         saved.insert(1, q.detach())
         for need_M in (True, False):
-            arguments = (*saved, torch.ones_like(q).detach(), None, need_M, *options)
+            arguments = (*saved, torch.ones_like(q).detach(), None, need_M, options[-1], in_kernel)
             torch.library.opcheck(torch.ops.lcplearn.adjoint.default, arguments)
 
 
