@@ -26,7 +26,7 @@ from lcplearn.datasets.contactnets import (
 )
 from lcplearn.datasets.files import check_offsets, find, positive_number, read_npz
 
-# Numbers of the published files, drawn once at random: with seed 0 everybody learns from and chooses by the same tosses.
+# Numbers of the published files, drawn once: with seed 0 everybody learns from the same tosses and chooses by the same.
 LEARN = (
     *(518, 21, 255, 246, 168, 414, 415, 263, 208, 310, 534, 397, 272, 554, 0, 344, 448, 194, 57, 542, 162, 285, 206),
     *(183, 11, 438, 118, 428, 202, 558, 93, 446, 369, 513, 136, 282, 449, 177, 483, 328, 317, 412, 210, 56, 521, 59),

@@ -1,14 +1,14 @@
 """How far predicted tosses of a cube are from recorded ones: the figures of ContactNets, and a few more.
 
-With recorded positions p and rotations R, predicted ones p^ and R^, the T rows of a toss (row 0 included) and the corners
+With recorded positions p and rotations R, predicted ones p^ and R^, the T rows of a toss (row 0 included) and corners
 c_i = (+-h, +-h, +-h) of the published cube of half width h:
 
     position integral      100 / 2h   mean_t |p^ - p|                            percent of the cube's width
     rotation integral      180 / pi   mean_t angle(R^T R^)                       degrees
     penetration integral   100 / 2h   mean_t max(0, -min_i (p^ + R^ c_i)_z)      percent of the cube's width
 
-The cube's symmetry is not used: its faces are tagged. A few tosses that come to rest on another face dominate the means,
-so medians stand beside them. Source: Pfrommer, Halm, Posa, "ContactNets", CoRL 2020, figure 5.
+The cube's symmetry is not used: its faces are tagged. A few tosses that come to rest on another face dominate the
+means, so medians stand beside them. Source: Pfrommer, Halm, Posa, "ContactNets", CoRL 2020, figure 5.
 """
 
 import math
@@ -147,7 +147,7 @@ def format_scores(scores: Mapping[str, Float[Tensor, " N"]]) -> str:
 
 
 def _lowest_corner(state: Float[Tensor, "*batch 13"], half_width: float) -> Float[Tensor, "*batch"]:
-    """Height over z = 0 of the published cube's lowest corner: |R_z1| + |R_z2| + |R_z3| half widths below the centre."""
+    """Height over z = 0 of the cube's lowest corner: |R_z1| + |R_z2| + |R_z3| half widths below the centre."""
     up = rotation_matrix(_unit(state))[..., 2, :]
     return state[..., 2] - half_width * up.abs().sum(-1)
 
