@@ -1,16 +1,18 @@
 """Predict with a trained model: python -m lcplearn.predict CHECKPOINT --input forces.csv --output motion.csv
 
 CSV input has a header and a column `force` [N], one row a time step; models that need measured friction also read
-`friction_plus` and `friction_minus` [N]. NPZ input has `forces` [T] or [N, T], and may have `friction` [..., T, 2] and
-`state` [..., 2]. `--score DATA` judges the model on recordings instead: cube_slides.npz, or an NPZ file with `dt` and
-the arrays of lcplearn.datasets.Recordings.
+`friction_plus` and `friction_minus` [N]; a column `time_s` or `time` [s] must have the model's steps. NPZ input has
+`forces` [T], [T, 1] or [N, T], and may have `friction` [..., T, 2], `state` [..., 2] and `dt` [s]. `--score DATA`
+judges the model on recordings instead: cube_slides.npz, or an NPZ file with `dt` and the arrays of
+lcplearn.datasets.Recordings.
 """
 
 import argparse
 import csv
-import json
+import re
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,12 +22,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.datasets import BlockData, read_all_cube_slides, read_recordings
-from lcplearn.datasets.files import read_npz
+from lcplearn.datasets.files import find, positive_number, read_npz
 from lcplearn.formulations import Formulation
 from lcplearn.scenes.rollout import Mode, Trajectory
 from lcplearn.training.checkpoint import load
 
 FRICTION = ("friction_plus", "friction_minus")
+TIME = ("time_s", "time")
 
 
 class Inputs(NamedTuple):
@@ -35,11 +38,13 @@ class Inputs(NamedTuple):
         forces: Force of each step [N].
         friction: Measured friction of each step [N], None if there is none.
         state: Position [m] and velocity [m/s] at the start, None if the file has none.
+        dt: Time of a step [s], None if the file has none.
     """
 
     forces: Float[Tensor, "*batch T 1"]
     friction: Float[Tensor, "*batch T 2"] | None
     state: Float[Tensor, "*batch 2"] | None
+    dt: float | None = None
 
 
 def read_inputs(path: str | Path) -> Inputs:
@@ -59,13 +64,20 @@ def read_inputs(path: str | Path) -> Inputs:
     for name, tensor in (("forces", forces), ("friction", friction), ("state", state)):
         if tensor is not None and not bool(tensor.isfinite().all()):
             raise ValueError(f"{path}: {name} must be finite numbers.")
-    if forces.ndim == 0 or forces.shape[-1] == 0:
+    if forces.ndim == 0 or forces.shape[-1] == 0 or forces.numel() == 0:
         raise ValueError(f"{path}: forces must have at least one step.")
+    if forces.ndim > 1 and forces.shape[-1] == 1:  # as model.rollout takes them
+        forces = forces[..., 0]
+    if forces.ndim > 2:
+        raise ValueError(
+            f"{path}: forces must have shape [T], [T, 1], [N, T] or [N, T, 1], got {list(tensors['forces'].shape)}."
+        )
     if friction is not None and friction.shape != (*forces.shape, 2):
         raise ValueError(f"{path}: friction must have shape {[*forces.shape, 2]}, got {list(friction.shape)}.")
     if state is not None and state.shape not in ((2,), (*forces.shape[:-1], 2)):
         raise ValueError(f"{path}: state must have shape {[*forces.shape[:-1], 2]} or [2], got {list(state.shape)}.")
-    return Inputs(forces[..., None], friction, state)
+    dt = tensors.get("dt")
+    return Inputs(forces[..., None], friction, state, None if dt is None else positive_number(path, "dt", dt.numpy()))
 
 
 @torch.no_grad()
@@ -78,8 +90,13 @@ def predict(model: Formulation, inputs: Inputs, state: Float[Tensor, "*batch 2"]
         state: Position [m] and velocity [m/s] at the start; the inputs' own, else rest at 0, by default.
 
     Raises:
-        ValueError: the model needs measured friction and the inputs have none, or the state is not finite.
+        ValueError: the model needs measured friction and the inputs have none, their time step is another than the
+            model's, or the state is not finite.
     """
+    if inputs.dt is not None and abs(inputs.dt / model.dt - 1.0) > 1e-6:
+        raise ValueError(
+            f"The input has time steps of {inputs.dt:.6g} s, but the model was trained for {model.dt:.6g} s."
+        )
     if model.needs_friction and inputs.friction is None:
         raise ValueError(
             f"{type(model).__name__} needs measured friction: the columns {' and '.join(FRICTION)} in a CSV file, "
@@ -122,6 +139,8 @@ def read_data(path: str | Path, model: Formulation) -> BlockData:
         FileNotFoundError: no such file.
         ValueError: not a file of recordings, or one with another time step than the model's.
     """
+    if not Path(path).exists() and str(Path(path).parent) in (".", "data"):
+        path = find(Path(path).name)  # where train.py looks
     slides = "offsets" in read_npz(path, (), optional=("offsets",))
     data = read_all_cube_slides(path) if slides else read_recordings(path, gravity=model.gravity)
     if abs(data.dt / model.dt - 1.0) > 1e-9:
@@ -142,41 +161,57 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what.add_argument("--score", metavar="DATA", help="recordings to judge the model on, NPZ")
     parser.add_argument("--output", help="where to write: motion as CSV or NPZ, or the score as JSON")
     parser.add_argument("--state", nargs=2, type=float, metavar=("POSITION", "VELOCITY"), help="start [m, m/s]")
-    parser.add_argument("--plot", metavar="PNG", help="picture of the motion")
+    parser.add_argument("--plot", metavar="PICTURE", help="picture of the motion: PNG, PDF or SVG")
+    parser.add_argument(
+        "--trust", action="store_true", help="import the model's class from any module that the file names"
+    )
+    parser.add_argument("--version", action="version", version=f"lcplearn {version('lcplearn')}")
     options = parser.parse_args(arguments)
     if options.score and (options.state or options.plot):
         parser.error("--state and --plot go with --input")
     try:
         _score(options) if options.score else _predict(options)
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        sys.exit(f"{error.filename}: {error.strerror}." if error.filename and error.strerror else f"{error}.")
+    except ValueError as error:
         sys.exit(str(error))
 
 
 def _predict(options: argparse.Namespace) -> None:
-    model = load(options.checkpoint, "cpu")
+    model = load(options.checkpoint, "cpu", trust=options.trust)
     state = None if options.state is None else torch.tensor(options.state, dtype=torch.float64)
     inputs = read_inputs(options.input)
     trajectory = predict(model, inputs, state)
     steps, stuck = trajectory.mode.shape[-2], float((trajectory.mode == Mode.STICK).double().mean())
-    print(f"{type(model).__name__}: {steps} steps of {model.dt:.4g} s, at rest in {stuck:.0%} of them")
+    for path in (options.output, options.plot):
+        if path:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
     if options.output:
         write(options.output, trajectory, model.dt)
     if options.plot:
         _draw(inputs, trajectory, model.dt).savefig(options.plot, dpi=120)
+    several = f"{len(trajectory.mode)} trajectories of " if trajectory.mode.ndim > 2 else ""
+    print(
+        f"{type(model).__name__}: {several}{steps} step{'s' * (steps > 1)} of {model.dt:.4g} s, "
+        f"at rest in {stuck:.0%} of them"
+    )
 
 
 def _score(options: argparse.Namespace) -> None:
     from lcplearn.training.metrics import evaluate, format_table
+    from lcplearn.training.writing import write_figures
 
-    model = load(options.checkpoint, "cpu")
+    model = load(options.checkpoint, "cpu", trust=options.trust)
     metrics = evaluate(model, read_data(options.score, model))
     print(format_table(metrics))
     if options.output:
-        Path(options.output).write_text(json.dumps(metrics, indent=2) + "\n")
+        write_figures(options.output, metrics)
 
 
 def _draw(inputs: Inputs, trajectory: Trajectory, dt: float) -> Any:
     from matplotlib.figure import Figure
+
+    from lcplearn.training.figures import strip
 
     figure = Figure(figsize=(8.0, 6.0), layout="constrained")
     rows = [
@@ -185,43 +220,73 @@ def _draw(inputs: Inputs, trajectory: Trajectory, dt: float) -> Any:
         ("position [m]", trajectory.positions[..., 0]),
     ]
     time = torch.arange(trajectory.positions.shape[-2]) * dt
-    for ax, (label, values) in zip(figure.subplots(3, 1, sharex=True), rows, strict=True):
+    axes = figure.subplots(3, 1, sharex=True)
+    for ax, (label, values) in zip(axes, rows, strict=True):
         series = values.reshape(-1, values.shape[-1])
         for line in series[:10]:
             ax.stairs(line, time, baseline=None, linewidth=1.5) if label.startswith("force") else ax.plot(time, line)
         ax.set_ylabel(label)
         ax.grid(alpha=0.3)
     ax.set_xlabel("time [s]")
+    if trajectory.velocities.ndim == 2:
+        strip(axes[1], time, trajectory.velocities[:, 0], 0.02, "tab:red", "at rest")
+        axes[1].legend(fontsize=8)
     return figure
 
 
 def _read_csv(path: Path) -> dict[str, Any]:
+    """Columns of numbers; whatever else stands in the file is refused, with its line."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a file with a byte order mark
-            reader = csv.DictReader(file, skipinitialspace=True)
-            rows, header = list(reader), list(reader.fieldnames or [])
+            reader = csv.reader(file, skipinitialspace=True)
+            lines = [(reader.line_num, cells) for cells in reader]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file: {error}.") from None
-
-    def column(name: str) -> list[float]:
-        values = []
-        for line, row in enumerate(rows, start=2):
-            try:
-                values.append(float(row[name]))
-            except (TypeError, ValueError):
-                raise ValueError(f"{path}, line {line}: {name} must be a number, got {row[name]!r}.") from None
-        return values
-
+    while lines and not any(cell.strip() for cell in lines[-1][1]):  # editors end a file with empty lines
+        lines.pop()
+    header = [name.strip() for name in lines.pop(0)[1]] if lines else []
+    twice = sorted({name for name in header if header.count(name) > 1})
+    if twice:
+        raise ValueError(f"{path}, line 1: there are several columns '{twice[0]}'.")
     if "force" not in header:
         return dict.fromkeys(header)
+    for line, cells in lines:
+        if not any(cell.strip() for cell in cells):
+            raise ValueError(f"{path}, line {line} is empty, but each line is one time step.")
+        if len(cells) != len(header):
+            hint = "; decimals have a point, not a comma" if len(cells) > len(header) else ""
+            raise ValueError(f"{path}, line {line} has {len(cells)} cells, but the header {len(header)}{hint}.")
+
+    def column(name: str) -> list[float]:
+        index = header.index(name)
+        return [_number(cells[index], f"{path}, line {line}: {name}") for line, cells in lines]
+
     arrays: dict[str, Any] = {"forces": column("force")}
     if set(FRICTION) <= set(header):
         arrays["friction"] = np.array([column(name) for name in FRICTION]).T
+    clock = next((name for name in TIME if name in header), None)
+    if clock is not None and len(lines) > 1:
+        time = np.array(column(clock))
+        steps = np.diff(time)
+        arrays["dt"] = (time[-1] - time[0]) / len(steps)
+        if not arrays["dt"] > 0 or np.abs(steps / arrays["dt"] - 1.0).max() > 1e-3:
+            raise ValueError(f"{path}: {clock} must rise by equal steps [s].")
     return arrays
 
 
+def _number(text: str, what: str) -> float:
+    """A decimal number; Python's own `float` would take 1_000 too."""
+    try:
+        if "_" in text:
+            raise ValueError
+        return float(text)
+    except ValueError:
+        hint = "; decimals have a point, not a comma" if re.fullmatch(r"\s*[+-]?\d+,\d+\s*", text) else ""
+        raise ValueError(f"{what} must be a number, got {text!r}{hint}.") from None
+
+
 def _read_npz(path: Path) -> dict[str, Any]:
-    arrays = read_npz(path, ("forces",), optional=("friction", "state"))
+    arrays = read_npz(path, ("forces",), optional=("friction", "state", "dt"))
     text = [name for name, array in arrays.items() if array.dtype.kind == "U"]
     if text:
         raise ValueError(f"{path}: {text[0]} must be numbers, got text.")

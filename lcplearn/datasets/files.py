@@ -56,7 +56,7 @@ def read_npz(
                 )
             there = [*keys, *(key for key in optional if key in file)]
             arrays = {key: np.asarray(file[key]) for key in there}  # a member that is no array comes as bytes
-    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
         reason = "arrays of Python objects (pickles) are not read" if "allow_pickle" in str(error) else error
         raise ValueError(f"{path}: {reason}") from None
     for key, array in arrays.items():

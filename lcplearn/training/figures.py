@@ -82,8 +82,8 @@ def rollouts(model: Formulation, data: BlockData, count: int = 3) -> "Figure":
         ax.plot(time, predicted.clamp(-far, far), label="rolled out from the start", **LEARNED)
         ax.set(ylim=(low - 0.22 * (high - low), high), ylabel="velocity [m/s]")
         if data.test.true_velocities is not None:  # a measured velocity is never exactly zero
-            _strip(ax, time, true[row, : steps + 1], 0.01, "black", "true at rest", alpha=0.35)
-        _strip(ax, time, velocity[row, : steps + 1], 0.08, "tab:red", "predicted at rest")
+            strip(ax, time, true[row, : steps + 1], 0.01, "black", "true at rest", alpha=0.35)
+        strip(ax, time, velocity[row, : steps + 1], 0.08, "tab:red", "predicted at rest")
     axes[-1][0].set_xlabel("time [s]")
     axes[0][0].legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     return figure
@@ -112,11 +112,11 @@ def stops(model: Formulation, data: BlockData) -> "Figure":
     return figure
 
 
-def _strip(
+def strip(
     ax: "Axes", time: Tensor, velocity: Tensor, bottom: float, colour: str, label: str, alpha: float = 1.0
 ) -> None:
-    """Mark the steps after which the block rests, at a height given in parts of the axes."""
-    still, dt = velocity[1:].abs() < STICK_SPEED, float(time[1] - time[0])
+    """Mark the steps that begin at rest, at a height given in parts of the axes."""
+    still, dt = velocity[:-1].abs() < STICK_SPEED, float(time[1] - time[0])
     spans = [(float(start), dt) for start in time[:-1][still]] or [(0.0, 0.0)]
     ax.broken_barh(
         spans, (bottom, 0.05), facecolors=colour, alpha=alpha, linewidth=0,

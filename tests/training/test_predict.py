@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def needs_friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def forces_csv(folder: Path, header: str = "time,force", rows: list[str] | None = None) -> Path:
     path = folder / "forces.csv"
-    path.write_text("\n".join([header, *(rows or [f"{k},{u}" for k, u in enumerate(FORCES)])]) + "\n")
+    path.write_text("\n".join([header, *(rows or [f"{k * 0.05},{u}" for k, u in enumerate(FORCES)])]) + "\n")
     return path
 
 
@@ -96,7 +97,15 @@ def test_scoring_the_test_recordings_gives_the_figures_of_the_run(checkpoint: Pa
         ("force", ["1.0", "x"], "line 3: force must be a number, got 'x'"),
         ("force", ["1.0", "nan"], "forces must be finite numbers"),
         ("force", [""], "forces must have at least one step"),
-        ("force,friction_plus,friction_minus", ["1.0,2.0"], "line 2: friction_minus must be a number, got None"),
+        ("force,friction_plus,friction_minus", ["1.0,2.0"], "line 2 has 2 cells, but the header 3"),
+        ("force", ["1,5"], "line 2 has 2 cells, but the header 1; decimals have a point, not a comma"),
+        ("force;x", ["1;2"], "has no column 'force'; it has force;x"),
+        ("time,force", ["0.0,1", '0.05,"1,5"'], "line 3: force must be a number, got '1,5'; decimals have a point"),
+        ("force", ["1", "", "2"], "line 3 is empty, but each line is one time step"),
+        ("force,force", ["1,2"], "line 1: there are several columns 'force'"),
+        ("force", ["1_000"], "line 2: force must be a number, got '1_000'"),
+        ("time_s,force", ["0,1", "0.01,1"], "has time steps of 0.01 s, but the model was trained for 0.05 s"),
+        ("time,force", ["0,1", "0.05,1", "0.2,1"], "time must rise by equal steps"),
     ],
 )
 def test_a_wrong_input_file_gets_one_sentence(
@@ -115,6 +124,79 @@ def test_a_csv_file_as_spreadsheets_write_it_is_read(tmp_path: Path) -> None:
     path.write_bytes(b"PK\x03\x04\xff\xfe")
     with pytest.raises(ValueError, match="is not a CSV file"):
         predict.read_inputs(path)
+
+
+@pytest.mark.parametrize(("shape", "steps"), [((3,), (3,)), ((3, 1), (3,)), ((2, 3), (2, 3)), ((2, 3, 1), (2, 3))])
+def test_forces_with_a_last_axis_of_one_are_what_rollout_takes(
+    shape: tuple[int, ...], steps: tuple[int, ...], tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "in.npz", forces=np.ones(shape))
+    assert predict.read_inputs(tmp_path / "in.npz").forces.shape == (*steps, 1)
+
+
+def test_an_npz_input_of_another_time_step_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", forces=np.ones(3), dt=0.01)
+    with pytest.raises(SystemExit, match=r"time steps of 0\.01 s, but the model was trained for 0\.05 s"):
+        predict.main([str(checkpoint), "--input", str(tmp_path / "in.npz")])
+
+
+def test_recordings_are_looked_for_where_train_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tiny_data()
+    arrays = {name: value.numpy() for name, value in data.test._asdict().items() if value is not None}
+    np.savez(tmp_path / "mine.npz", dt=data.dt, **arrays)
+    monkeypatch.setenv("LCPLEARN_DATA", str(tmp_path))
+    for name in ("mine.npz", "data/mine.npz"):
+        assert len(predict.read_data(name, Structured(dt=data.dt)).test.steps) == len(data.test.steps)
+    with pytest.raises(FileNotFoundError, match=r"LCPLEARN_DATA can name its folder"):
+        predict.read_data("data/yours.npz", Structured(dt=data.dt))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"formulation": [1]},
+        {"formulation": {}},
+        {"formulation": {"class": 7, "arguments": {}}},
+        {"state_dict": None},
+        {"state_dict": {"model.x": "text"}},
+    ],
+)
+def test_a_checkpoint_of_another_form_gets_one_sentence(
+    changes: dict[str, Any], checkpoint: Path, tmp_path: Path
+) -> None:
+    torch.save(torch.load(checkpoint) | changes, tmp_path / "odd.ckpt")
+    with pytest.raises(ValueError, match=r"odd\.ckpt is not a checkpoint of lcplearn\.$"):
+        lcplearn.load(tmp_path / "odd.ckpt")
+
+
+def test_a_truncated_checkpoint_says_so(checkpoint: Path, tmp_path: Path) -> None:
+    (tmp_path / "part.ckpt").write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="it is truncated, another kind of file"):
+        lcplearn.load(tmp_path / "part.ckpt")
+
+
+def test_parameters_that_are_not_finite_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+    content = torch.load(checkpoint)
+    next(iter(content["state_dict"].values())).fill_(float("nan"))
+    torch.save(content, tmp_path / "nan.ckpt")
+    with pytest.raises(ValueError, match="is not finite; the training that wrote it had diverged"):
+        lcplearn.load(tmp_path / "nan.ckpt")
+
+
+def test_a_checkpoint_imports_no_module_that_is_not_trusted(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evil_module.py").write_text("from lcplearn.formulations import Structured\nprint('ran')\n")
+    content = torch.load(checkpoint)
+    content["formulation"]["class"] = "evil_module.Structured"
+    torch.save(content, tmp_path / "evil.ckpt")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match="importing evil_module runs its code"):
+        lcplearn.load(tmp_path / "evil.ckpt")
+    assert "evil_module" not in sys.modules
+    assert isinstance(lcplearn.load(tmp_path / "evil.ckpt", trust=True), Structured)
+    assert isinstance(lcplearn.load(tmp_path / "evil.ckpt"), Structured)  # it is loaded already
+    del sys.modules["evil_module"]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +248,7 @@ def test_files_that_are_no_checkpoint_or_no_data_get_one_sentence(checkpoint: Pa
             [str(checkpoint), "--input", str(text), "--state", "0", "nan"],
             "state: expected finite position and velocity",
         ),
-        ([str(checkpoint), "--input", str(text), "--output", str(tmp_path / "none" / "a.csv")], "No such file"),
+        ([str(checkpoint), "--input", str(text), "--output", "/proc/none/a.csv"], "^/proc/none: No such file"),
     ]
     for arguments, message in cases:
         with pytest.raises(SystemExit, match=message):
