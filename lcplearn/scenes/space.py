@@ -108,6 +108,7 @@ POSE = Space(
 
 def quaternion_product(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "... 4"]:
     """Hamilton's product of quaternions (w, x, y, z): the rotation b, then a."""
+    a, b = torch.broadcast_tensors(a, b)
     scalar = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(-1, keepdim=True)
     vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + torch.linalg.cross(a[..., 1:], b[..., 1:])
     return torch.cat((scalar, vector), dim=-1)

@@ -1,0 +1,254 @@
+"""Contacts in, next velocity out: one step of any rigid scene with Coulomb's cone, exactly.
+
+A scene gives gaps, Jacobians and a free velocity; `contact_step` finds the velocity after the step. It makes rows only
+for contacts that close, checks the others afterwards, and adds what it was wrong about. Nothing here knows of shapes.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lcplearn.scenes.friction_lcp import ROUNDING, Answer, Problem, cone_lcp, frictionless_lcp, polygon_lcp
+from lcplearn.scenes.scene import Mode
+
+MAX_ITERATIONS = 40  # of the cone's fixed point; the mean is about 2
+SETTLED = 1e-10  # change of velocity from one iterate to the next, relative to the free velocity, in the mass norm
+DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
+
+
+class Contacts(NamedTuple):
+    """What may touch during a step; C contacts with T friction directions each (0, 1 in a plane, 2 in space).
+
+    Attributes:
+        gap: Distance before the step [m]; negative where bodies overlap.
+        normal: Jacobian of the normal speed, positive where the gap opens.
+        tangents: Jacobians of the slip along T orthonormal directions.
+        mu: Friction coefficient; >= 0.
+        bounce: Normal speed that restitution asks for [m/s]; >= 0. See `closing_speed`.
+        compliance: Normal speed by which a unit of normal impulse may sink [1/kg]; >= 0. It makes the split of forces
+            among redundant contacts unique. Where a body slides and spins on four coplanar corners the split decides
+            the velocity, too. 1e-6 to 1e-3 of 1 / mass; at rest a contact then lies compliance * dt * impulse deep.
+    """
+
+    gap: Float[Tensor, "*#batch C"]
+    normal: Float[Tensor, "*#batch C nv"]
+    tangents: Float[Tensor, "*#batch C T nv"]
+    mu: Float[Tensor, "*#batch C"]
+    bounce: Float[Tensor, "*#batch C"]
+    compliance: Float[Tensor, "*#batch C"]
+
+
+class ContactStep(NamedTuple):
+    """What a step of contacts gives.
+
+    Attributes:
+        velocity: Velocity after the step; exactly 0 where the body rests.
+        normal_impulse: [N s]; >= 0.
+        friction_impulse: Along the contact's T tangents [N s].
+        mode: `Mode` of each contact.
+        at_rest: Whether sticking contacts hold all of the velocity, so that its 0 was written and not computed.
+        solved: Whether the last LCP was solved.
+        settled: Whether the cone's fixed point was reached; always where there is at most one friction direction.
+    """
+
+    velocity: Float[Tensor, "*batch nv"]
+    normal_impulse: Float[Tensor, "*batch C"]
+    friction_impulse: Float[Tensor, "*batch C T"]
+    mode: Int[Tensor, "*batch C"]
+    at_rest: Bool[Tensor, "*batch"]
+    solved: Bool[Tensor, "*batch"]
+    settled: Bool[Tensor, "*batch"]
+
+
+def closing_speed(
+    gap: Float[Tensor, "*#batch C"],
+    before: Float[Tensor, "*#batch C"],
+    free: Float[Tensor, "*#batch C"],
+    dt: float,
+    *,
+    continuous: bool = True,
+) -> Float[Tensor, "..."]:
+    """Speed of an impact [m/s], of which a contact gives back restitution times as much.
+
+    Newton's law takes the speed before the step, -before, of every contact that would close, gap + dt free < 0. It
+    jumps where a contact begins to close. The continuous variant takes the part of the speed that is left when the gap
+    is used up, max(0, -before - max(gap, 0) / dt).
+
+    Args:
+        gap: [m].
+        before: Normal speed before the step [m/s].
+        free: Normal speed after the step if nothing touched [m/s].
+        dt: Step size [s].
+        continuous: Which of the two.
+    """
+    if continuous:
+        return torch.relu(-before - torch.relu(gap) / dt)
+    return torch.where(gap + dt * free < 0.0, torch.relu(-before), 0.0)
+
+
+def contact_step(
+    contacts: Contacts,
+    free: Float[Tensor, "*#batch nv"],
+    mass: Float[Tensor, "*#batch nv"],
+    dt: float,
+    *,
+    polygon: int | None = None,
+    rest: bool = True,
+) -> ContactStep:
+    """Velocity after a step in which contacts don't penetrate and Coulomb's friction acts.
+
+    v' = free + mass^-1 sum_i (n_i' lambda_i + T_i' f_i), where for each contact
+
+        0 <= lambda ⟂ n v' + gap / dt - bounce + compliance lambda >= 0,
+        |f| <= mu lambda,  and  f = -mu lambda T v' / |T v'|  where it slips.
+
+    In space the cone is the fixed point of small LCPs (see `friction_lcp`), which are iterated without gradient; the
+    last one alone is differentiated, which is exact there.
+
+    Args:
+        contacts: What may touch.
+        free: Velocity after the step if nothing touched.
+        mass: Diagonal of the mass matrix [kg, kg m^2].
+        dt: Step size [s].
+        polygon: None is the exact cone; k is a polygon of 2 k directions in its place, for comparison.
+        rest: Whether a body that sticking contacts hold gets the velocity 0 to the last bit. Gradients don't change.
+
+    Gradient:
+        Implicit, with respect to all tensors. With a polygon it is wrong in practice: the velocity is a staircase.
+
+    Source: Stewart and Trinkle 1996 (time stepping); NOTES 5.7 (cone, gradient, rest).
+    """
+    problem, batch = _flatten(contacts, free, mass, dt)
+    with torch.no_grad():
+        found, active = _find(Problem(*(x.detach() if isinstance(x, Tensor) else x for x in problem)), polygon)
+        at_rest = _at_rest(problem, found) if rest else torch.zeros_like(found.solved)
+    answer = found._replace(solved=found.solved & problem.excess(found.velocity).isfinite().all(-1))
+    if torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in problem):
+        answer = _differentiable(problem, answer, active, polygon)
+    velocity = answer.velocity
+    # The value is exactly 0, and the gradient that of the computed velocity.
+    velocity = torch.where(at_rest.unsqueeze(-1), velocity - velocity.detach(), velocity)
+    slips = torch.where(found.sticks | at_rest.unsqueeze(-1), int(Mode.STICK), int(Mode.SLIP))
+    mode = torch.where(found.normal > 0.0, slips, int(Mode.SEPARATION))
+    numbers = (x.to(free.dtype) for x in (velocity, answer.normal, answer.friction))
+    parts = (*numbers, mode, at_rest, answer.solved, found.settled)
+    return ContactStep(*(x.reshape((*batch, *x.shape[1:])) for x in parts))
+
+
+def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple[Problem, torch.Size]:
+    """One problem with a single batch dimension, in float64, and the batch dimensions that it stands for."""
+    gap, normal, tangents, mu, bounce, compliance = contacts
+    shapes = (x.shape[:-k] for x, k in ((gap, 1), (normal, 2), (tangents, 3), (mu, 1), (free, 1), (mass, 1)))
+    batch = torch.broadcast_shapes(*shapes, bounce.shape[:-1], compliance.shape[:-1])
+    count, nv, directions = normal.shape[-2], normal.shape[-1], tangents.shape[-2]
+
+    def flat(x: Tensor, *shape: int) -> Tensor:
+        return x.expand(*batch, *shape).reshape(batch.numel(), *shape).double()
+
+    return (
+        Problem(
+            target=flat(bounce - gap / dt, count),
+            normal=flat(normal, count, nv),
+            tangents=flat(tangents, count, directions, nv),
+            mu=flat(mu, count),
+            compliance=flat(compliance, count),
+            free=flat(free, nv),
+            mass=flat(mass, nv),
+        ),
+        batch,
+    )
+
+
+def _find(problem: Problem, polygon: int | None) -> tuple[Answer, Tensor]:
+    """Solve with rows for the contacts that close alone; and which these are. Elements with as many go together."""
+    answer = Answer.free_flight(problem)
+    tolerance = ROUNDING * problem.speed_scale()
+    new = problem.excess(problem.free) < 0.0
+    active = new
+    while (todo := new.any(-1)).any():
+        for elements, rows in _buckets(active, todo):
+            part = problem.pick(elements, rows)
+            found = _iterate(part) if part.directions == 2 and polygon is None else _once(part, polygon)
+            answer.put(elements, rows, found)
+        new = (problem.excess(answer.velocity) < -tolerance) & ~active
+        active = active | new
+    return answer, active
+
+
+def _buckets(active: Tensor, todo: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Elements [b] with equally many active contacts, and these contacts [b, K], for each number K > 0."""
+    counts = torch.where(todo, active.sum(-1), 0)
+    result = []
+    for count in counts.unique().tolist():
+        if count:
+            elements = torch.nonzero(counts == count)[:, 0]
+            rows = torch.nonzero(active[elements])[:, 1].reshape(-1, count)
+            result.append((elements, rows))
+    return result
+
+
+def _once(part: Problem, polygon: int | None, guide: Answer | None = None) -> Answer:
+    """One LCP: what needs no fixed point, or the last iterate of what does, at its directions."""
+    if part.directions == 0:
+        return frictionless_lcp(part)
+    if polygon is not None and part.directions == 2:
+        return polygon_lcp(part, polygon)
+    return cone_lcp(part, guide)
+
+
+def _iterate(part: Problem) -> Answer:
+    """Newton's iteration for the cone; elements leave when they have settled."""
+    guess = Answer.guess(part)
+    result, todo = guess.clone(), torch.arange(len(part.free), device=part.free.device)
+    scale = part.mass_norm(part.free)
+    old = torch.full_like(scale, torch.inf)
+    for iteration in range(MAX_ITERATIONS):
+        new = cone_lcp(part, guess)
+        change = part.mass_norm(new.velocity - guess.velocity)
+        new = new._replace(settled=change <= SETTLED * (scale + part.mass_norm(new.velocity)))
+        result.put(todo, None, new)
+        going = torch.nonzero(~(new.settled & new.solved))[:, 0]
+        if not len(going):
+            break
+        # Undamped, 1 to 3 in 100 cycle.
+        damped = (change > 0.3 * old) & (iteration > 3)
+        guess = guess.toward(new, torch.where(damped, 0.5, 1.0)).pick(going)
+        part, todo, scale, old = part.pick(going), todo[going], scale[going], change[going]
+    return result
+
+
+def _differentiable(problem: Problem, found: Answer, active: Tensor, polygon: int | None) -> Answer:
+    """The same answer with its gradient: the last LCP, at the directions and speeds that were found."""
+    velocity, normal, friction = problem.free, torch.zeros_like(found.normal), torch.zeros_like(found.friction)
+    solved = found.solved
+    for elements, rows in _buckets(active, active.any(-1)):
+        part = _once(problem.pick(elements, rows), polygon, found.pick(elements, rows))
+        velocity = velocity.index_put((elements,), part.velocity)
+        place = (elements.unsqueeze(-1), rows)
+        normal, friction = normal.index_put(place, part.normal), friction.index_put(place, part.friction)
+        solved = solved.index_put((elements,), part.solved & solved[elements])
+    return found._replace(velocity=velocity, normal=normal, friction=friction, solved=solved)
+
+
+def _at_rest(problem: Problem, found: Answer) -> Tensor:
+    """Where contacts leave no velocity but 0: the rows that hold it have full rank.
+
+    A loaded contact that sticks holds all its directions, one that only touches (redundant corners) holds its normal.
+    """
+    nv, directions = problem.free.shape[-1], problem.directions
+    normal_speed = (problem.normal @ found.velocity.unsqueeze(-1)).squeeze(-1)
+    limit = DEAD_ZONE * problem.speed_scale()
+    touches = (normal_speed.abs() <= limit) & (problem.excess(found.velocity) <= limit)
+    holds = touches & (found.normal > 0.0) & found.sticks
+    result = found.solved & found.settled & (touches.sum(-1) + directions * holds.sum(-1) >= nv)
+    elements = torch.nonzero(result)[:, 0]
+    if directions == 0 or not len(elements):
+        return result & (directions > 0)
+    kept = torch.cat((touches.unsqueeze(-1), holds.unsqueeze(-1).expand(*holds.shape, directions)), dim=-1)[elements]
+    rows = torch.cat((problem.normal.unsqueeze(-2), problem.tangents), dim=-2)[elements]
+    rows = (rows * kept.unsqueeze(-1) / problem.mass[elements].sqrt()[:, None, None]).flatten(1, 2)
+    spread = torch.linalg.eigvalsh(rows.mT @ rows)
+    result[elements] = spread[:, 0] > 1e-6 * spread[:, -1]
+    return result

@@ -1,0 +1,181 @@
+"""A convex body in space, tossed onto or sliding on level ground."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lcplearn.scenes.checks import require_positive
+from lcplearn.scenes.contact import Contacts, closing_speed, contact_step
+from lcplearn.scenes.scene import Drive, Step
+from lcplearn.scenes.space import POSE, Space, rotation_matrix
+
+Number = float | Tensor  # a tensor broadcasts over the batch, and may need a gradient
+
+
+@dataclass(frozen=True)
+class SpatialBody:
+    """A rigid body that touches the ground with spheres around its corners.
+
+    A state is `POSE`: position and quaternion, velocity of the centre of mass, angular velocity in body coordinates.
+    The drive is a force in world coordinates and a torque in body coordinates. A step is implicit Euler: velocities
+    from `contact_step`, then positions at the new velocities. Flight under constant force is exact at the velocities;
+    the torque-free spin keeps its energy (implicit midpoint).
+
+    Friction may differ at impacts: mu + (mu_impact - mu) min(1, closing / impact_speed), with the closing speed of
+    `closing_speed`.
+
+    Attributes:
+        corners: Centres of the spheres in body coordinates [m], [C, 3] or [*batch, C, 3]; the origin is the centre of
+            mass.
+        inertia: Moment of inertia [kg m^2], the same about every axis, or a tuple of three, about the body's axes.
+        mu: Friction coefficient; >= 0.
+        dt: Step size [s].
+        mass: [kg]. Only inertia / mass matters to the motion if no force is driven.
+        radius: Of the spheres [m]; 0 is sharp corners.
+        restitution: Part of the closing speed that comes back; from 0 to 1.
+        mu_impact: Friction coefficient of an impact at impact_speed and above; None is mu.
+        impact_speed: [m/s].
+        ground: Height of the ground [m].
+        gravity: Downward acceleration [m/s^2], or the vector of it [3], for a slope.
+        compliance: Of a contact, times mass (see `Contacts`).
+        continuous: The continuous variant of Newton's restitution, or the plain one.
+        polygon: None is the exact friction cone; k is a polygon of 2 k directions.
+        rest: Whether rest is written as 0 (see `contact_step`).
+
+    Source: Stewart and Trinkle 1996; NOTES 5.7.
+    """
+
+    corners: Tensor
+    inertia: Number | tuple[Number, Number, Number]
+    mu: Number
+    dt: float
+    mass: Number = 1.0
+    radius: Number = 0.0
+    restitution: Number = 0.0
+    mu_impact: Number | None = None
+    impact_speed: float = 1.0
+    ground: Number = 0.0
+    gravity: Number = 9.81
+    compliance: Number = 0.0
+    continuous: bool = True
+    polygon: int | None = None
+    rest: bool = True
+
+    def __post_init__(self) -> None:
+        require_positive(mass=self.mass, dt=self.dt, impact_speed=self.impact_speed)
+        for inertia in self.inertia if isinstance(self.inertia, tuple) else (self.inertia,):
+            require_positive(inertia=inertia)
+        if self.corners.ndim < 2 or self.corners.shape[-1] != 3:
+            raise ValueError(f"corners: expected shape [*batch, C, 3], got {list(self.corners.shape)}")
+
+    @property
+    def space(self) -> Space:
+        """`POSE`."""
+        return POSE
+
+    @property
+    def contacts(self) -> int:
+        """Number of corners."""
+        return self.corners.shape[-2]
+
+    def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
+        """Advance a state by one step; the mode is that of each corner."""
+        position, before = POSE.split(state)
+        turn = rotation_matrix(position[..., 3:])
+        mass = self._mass(state)
+        free = self._free_velocity(before, turn, drive.force, mass)
+        contacts = self._contacts(position, before, free, turn)
+        found = contact_step(contacts, free, mass, self.dt, polygon=self.polygon, rest=self.rest)
+        moved = POSE.advance(position, found.velocity, self.dt)
+        # Normalising a quaternion may move its last bit: what rests does not move at all.
+        moved = torch.where(found.at_rest.unsqueeze(-1), moved - moved.detach() + position.detach(), moved)
+        state = torch.cat((moved, found.velocity), dim=-1)
+        return Step(state, found.mode, None, found.solved & found.settled)
+
+    def _mass(self, like: Tensor) -> Tensor:
+        """Diagonal of the mass matrix [*batch, 6]."""
+        inertia = self.inertia if isinstance(self.inertia, tuple) else (self.inertia,) * 3
+        return _stack(self.mass, self.mass, self.mass, *inertia, like=like)
+
+    def _free_velocity(self, velocity: Tensor, turn: Tensor, force: Tensor, mass: Tensor) -> Tensor:
+        gravity = _tensor(self.gravity, velocity)
+        if gravity.shape[-1:] != (3,):
+            gravity = torch.stack((torch.zeros_like(gravity), torch.zeros_like(gravity), -gravity), dim=-1)
+        linear = velocity[..., :3] + self.dt * (gravity + force[..., :3] / mass[..., :3])
+        spin = velocity[..., 3:]
+        if isinstance(self.inertia, tuple):
+            spin = _midpoint_spin(spin, mass[..., 3:], self.dt)
+        spin = spin + self.dt * force[..., 3:] / mass[..., 3:]
+        return torch.cat(torch.broadcast_tensors(linear, spin), dim=-1)
+
+    def _contacts(self, position: Tensor, before: Tensor, free: Tensor, turn: Tensor) -> Contacts:
+        corners = self.corners.to(position)
+        radius, ground, mu, restitution = (
+            _tensor(x, position).unsqueeze(-1) for x in (self.radius, self.ground, self.mu, self.restitution)
+        )
+        centres = corners @ turn.mT
+        gap = position[..., 2:3] + centres[..., 2] - radius - ground
+        # A lever from the centre of mass to the lowest point of a sphere, and the three directions, in body coordinates
+        lever = corners - radius.unsqueeze(-1) * turn[..., 2:3, :]
+        linear = torch.eye(3, dtype=position.dtype, device=position.device).expand(*lever.shape[:-1], 3, 3)
+        angular = torch.linalg.cross(*torch.broadcast_tensors(lever.unsqueeze(-2), turn.unsqueeze(-3)))
+        x, y, normal = torch.cat(torch.broadcast_tensors(linear, angular), dim=-1).unbind(-2)
+        closing = closing_speed(gap, _times(normal, before), _times(normal, free), self.dt, continuous=self.continuous)
+        if self.mu_impact is not None:
+            share = torch.clamp(closing / self.impact_speed, max=1.0)
+            mu = mu + (_tensor(self.mu_impact, position).unsqueeze(-1) - mu) * share
+        compliance = _tensor(self.compliance, position) / _tensor(self.mass, position)
+        return Contacts(
+            gap=gap,
+            normal=normal,
+            tangents=torch.stack((x, y), dim=-2),
+            mu=mu,
+            bounce=restitution * closing,
+            compliance=compliance.unsqueeze(-1),
+        )
+
+
+def box_corners(half_widths: Tensor, radius: Number = 0.0) -> Tensor:
+    """Centres [8, 3] of spheres of a radius [m] that fit into the corners of a box with half widths [3] [m]."""
+    signs = torch.tensor(list(product((-1.0, 1.0), repeat=3)), dtype=half_widths.dtype, device=half_widths.device)
+    inner = half_widths - (radius.unsqueeze(-1) if isinstance(radius, Tensor) else radius)
+    return signs * inner.unsqueeze(-2)
+
+
+def _midpoint_spin(spin: Tensor, inertia: Tensor, dt: float) -> Tensor:
+    """Angular velocity after a torque-free step: I (w' - w) + dt m x I m = 0 with m = (w + w') / 2, by Newton.
+
+    m . I (w' - w) = 0, so the energy stays. Four iterations reach rounding for dt |w| up to about 1.
+    """
+    half = dt / 2.0
+    middle = spin
+    for _ in range(4):
+        error = inertia * (middle - spin) + half * torch.linalg.cross(middle, inertia * middle)
+        slope = torch.diag_embed(inertia).expand(*error.shape, 3) + half * (
+            _cross_matrix(middle) * inertia.unsqueeze(-2) - _cross_matrix(inertia * middle)
+        )
+        middle = middle - torch.linalg.solve(slope, error)
+    return 2.0 * middle - spin
+
+
+def _cross_matrix(a: Tensor) -> Tensor:
+    """The matrix of b -> a x b."""
+    x, y, z = a.unbind(-1)
+    o = torch.zeros_like(x)
+    rows = ((o, -z, y), (z, o, -x), (-y, x, o))
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _tensor(value: Number, like: Tensor) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=like.dtype, device=like.device)
+
+
+def _stack(*values: Number, like: Tensor) -> Tensor:
+    return torch.stack(torch.broadcast_tensors(*(_tensor(x, like) for x in values)), dim=-1)

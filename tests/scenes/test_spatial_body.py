@@ -1,0 +1,150 @@
+"""Bodies in space against flight, symmetries, rest, energy and differences."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lcplearn.scenes.scene import Drive, Mode, rollout
+from lcplearn.scenes.space import POSE, quaternion_product, rotation_matrix
+from lcplearn.scenes.spatial_body import SpatialBody, box_corners
+
+HALF = torch.tensor([0.05, 0.06, 0.07], dtype=torch.float64)
+CORNERS = box_corners(HALF)
+REST = torch.tensor([0.0, 0.0, 0.07, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+NOTHING = Drive(torch.zeros(6, dtype=torch.float64))
+
+
+@pytest.fixture(autouse=True)
+def _double_precision():
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def body(**other) -> SpatialBody:
+    given = {"corners": CORNERS, "inertia": (0.0011, 0.001, 0.0008), "mu": 0.4, "dt": 0.01, "mass": 0.4}
+    return SpatialBody(**(given | other))
+
+
+def tossed(count: int, seed: int = 0) -> Tensor:
+    """States just above the ground, tumbling."""
+    random = torch.Generator().manual_seed(seed)
+    turn = torch.randn(count, 4, generator=random)
+    turn = turn / turn.norm(dim=-1, keepdim=True)
+    low = (CORNERS @ rotation_matrix(turn).mT)[..., 2].amin(-1, keepdim=True)
+    height = 0.01 * torch.rand(count, 1, generator=random) - low
+    velocity = torch.randn(count, 6, generator=random) * torch.tensor([1.0, 1.0, 1.0, 5.0, 5.0, 5.0])
+    return torch.cat((torch.zeros(count, 2), height, turn, velocity), dim=-1)
+
+
+def test_a_tossed_box_loses_energy_never_penetrates_and_comes_to_exact_rest():
+    scene = body()
+    with torch.no_grad():
+        path = rollout(scene, tossed(20), Drive(torch.zeros(20, 150, 6)))
+    inertia = torch.tensor([0.4] * 3 + [0.0011, 0.001, 0.0008])
+    energy = (inertia * path.velocities.square()).sum(-1) / 2 + 0.4 * 9.81 * path.positions[..., 2]
+    assert (energy[:, 1:] <= energy[:, :-1] + 1e-12).all()
+    corners = (CORNERS @ rotation_matrix(path.positions[..., 3:]).mT)[..., 2] + path.positions[..., 2:3]
+    # a corner turns by dt w on an arc while its row is linear: dt^2 w^2 r / 2
+    turned = (0.01 * path.velocities[..., 3:].norm(dim=-1)).square() * HALF.norm() / 2
+    assert (corners[:, 1:].amin(-1) >= -turned.cummax(-1).values[:, 1:] - 1e-12).all()
+    assert (path.velocities[:, -1] == 0.0).all()
+    assert (path.mode[:, -1] == Mode.STICK).sum(-1).ge(2).all()
+    assert path.solved.double().mean() >= 0.998
+
+
+def test_gradients_of_a_step_are_those_of_differences():
+    names = ("mu", "mass", "radius", "restitution", "ground", "mu_impact")
+    value = torch.tensor([0.3, 0.4, 0.004, 0.2, 0.002, 0.2])
+    state = tossed(60, seed=1)
+    weights = torch.randn(60, 13, generator=torch.Generator().manual_seed(3))
+
+    def outcome(parameters: Tensor) -> Tensor:
+        scene = body(**dict(zip(names, parameters.unbind(-1), strict=True)), compliance=1e-3)
+        return (weights * scene.advance(state, NOTHING).state).sum(-1)
+
+    parameters = value.expand(60, 6).clone().requires_grad_()
+    gradient = torch.autograd.grad(outcome(parameters).sum(), parameters)[0]
+    with torch.no_grad():
+        steps = [(h, h * torch.eye(6)) for h in (1e-5, 1e-6)]
+        both = [[(outcome(value + d) - outcome(value - d)) / (2 * h) for d in step] for h, step in steps]
+    rough, fine = (torch.stack(x, dim=-1) for x in both)
+    scale = fine.abs().clamp_min(1e-3)
+    smooth = (rough - fine).abs() <= 1e-4 * scale
+    assert smooth.double().mean() > 0.9
+    assert ((gradient - fine).abs() <= 1e-4 * scale)[smooth].double().mean() >= 0.99
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_a_box_rests_exactly(slope):
+    gravity = 9.81 * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)])
+    scene = body(gravity=gravity, mu=0.3)
+    state = REST
+    with torch.no_grad():
+        for _ in range(50):
+            step = scene.advance(state, NOTHING)
+            assert (step.state == REST).all()
+            state = step.state
+
+
+def test_a_rotation_about_the_vertical_rotates_the_motion():
+    angle = 0.7
+    about = torch.tensor([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)])
+    turn = rotation_matrix(about)
+
+    def rotate(state: Tensor) -> Tensor:
+        position, quaternion, velocity, spin = state.split((3, 4, 3, 3), dim=-1)
+        return torch.cat((position @ turn.mT, quaternion_product(about, quaternion), velocity @ turn.mT, spin), dim=-1)
+
+    state = tossed(100, seed=2)
+    scene = body(compliance=1e-4)
+    with torch.no_grad():
+        here, there = scene.advance(state, NOTHING), scene.advance(rotate(state), NOTHING)
+    right = here.solved & there.solved
+    assert right.double().mean() > 0.98
+    assert (rotate(here.state) - there.state)[right].abs().amax() < 1e-8
+
+
+def test_flight_is_exact():
+    scene = body(inertia=0.001)
+    state = tossed(10) + torch.tensor([0.0, 0.0, 5.0] + [0.0] * 10)
+    with torch.no_grad():
+        path = rollout(scene, state, Drive(torch.zeros(10, 20, 6)))
+    velocity = state[:, 7:] + 0.2 * torch.tensor([0.0, 0.0, -9.81, 0.0, 0.0, 0.0])
+    torch.testing.assert_close(path.velocities[:, -1], velocity, rtol=0, atol=1e-13)
+    turned = POSE.advance(state[:, :7], state[:, 7:], 0.2)[:, 3:]
+    torch.testing.assert_close(path.positions[:, -1, 3:], turned, rtol=0, atol=1e-13)
+
+
+def test_batched_parameters_are_their_elements_one_by_one():
+    state, mu = tossed(1)[0], torch.tensor([0.1, 0.3, 0.9])
+    radius, inertia = torch.tensor([0.0, 0.01, 0.02]), torch.tensor([[0.001], [0.002]])
+    with torch.no_grad():
+        together = body(mu=mu, radius=radius, inertia=inertia).advance(state, NOTHING)
+        assert together.state.shape == (2, 3, 13)
+        assert together.mode.shape == (2, 3, 8)
+        for i in range(2):
+            for j in range(3):
+                alone = body(mu=mu[j], radius=radius[j], inertia=inertia[i, 0]).advance(state, NOTHING)
+                torch.testing.assert_close(together.state[i, j], alone.state, rtol=0, atol=1e-14)
+
+
+def test_float32_states_stay_float32_and_agree():
+    state = tossed(20)
+    with torch.no_grad():
+        single = body(corners=CORNERS.float()).advance(state.float(), Drive(torch.zeros(6, dtype=torch.float32)))
+        double = body().advance(state, NOTHING)
+    assert single.state.dtype is torch.float32
+    assert single.solved.all()
+    torch.testing.assert_close(single.state.double(), double.state, rtol=0, atol=1e-4)
+
+
+def test_a_state_of_nan_is_not_solved_and_harms_no_neighbour():
+    state = tossed(3)
+    state[1, 3] = torch.nan
+    with torch.no_grad():
+        step, alone = body().advance(state, NOTHING), body().advance(state[2:], NOTHING)
+    assert step.solved.tolist() == [True, False, True]
+    assert (step.state[2] == alone.state[0]).all()
