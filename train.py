@@ -80,7 +80,9 @@ def train(config: DictConfig) -> float:
         command = " ".join(["python train.py", *overrides, f"ckpt_path={os.path.relpath(stop.checkpoint)}"])
         raise KeyboardInterrupt(f"Stopped; to go on: {command}") from None
     if result.metrics is not None:
-        print(f"\n{format_table(result.metrics)}\n\nrun folder: {os.path.relpath(result.folder)}")
+        learned = ", ".join(f"{name} = {value:.6g}" for name, value in result.model.physical_parameters().items())
+        print(f"\n{format_table(result.metrics)}" + (f"\n\nlearned: {learned}" if learned else ""))
+        print(f"\nrun folder: {os.path.relpath(result.folder)}")
     return result.validation
 
 
@@ -89,18 +91,35 @@ def sentence(error: BaseException) -> str:
     from lcplearn.training.settings import explain
 
     failed_call = isinstance(error, InstantiationException) and error.__cause__ is not None
-    return explain(str(error.__cause__ if failed_call else error) or "Stopped.", CONF)
+    cause = error.__cause__ if failed_call else error
+    if isinstance(cause, OSError) and cause.filename and cause.strerror:
+        return f"{cause.filename}: {cause.strerror}."
+    return explain(str(cause) or "Stopped.", CONF)
 
 
-if __name__ == "__main__":
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
+def command(arguments: list[str]) -> None:
+    """Check what can be checked at once, then let Hydra run it."""
+    from lcplearn.training.command_line import prepare, settle, version_line
+    from lcplearn.training.settings import check_torchrun
+
+    if arguments == ["--version"]:
+        print(version_line())
+        return
+    folder = None
     try:
         if PROCESSES > 1:
-            from lcplearn.training.settings import check_torchrun
-
-            check_torchrun(sys.argv[1:])
+            check_torchrun(arguments)
+        else:
+            sys.argv[1:], folder = prepare(arguments, CONF)
         main()
     except (*MISTAKES, KeyboardInterrupt) as error:
         if DEBUGGING:
             raise
         sys.exit(sentence(error))
+    finally:
+        settle(folder)
+
+
+if __name__ == "__main__":
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
+    command(sys.argv[1:])

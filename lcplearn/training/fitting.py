@@ -137,6 +137,12 @@ def fit(
         callbacks.append(EpochBar())
     if patience is not None:
         callbacks.append(EarlyStop(VALIDATION, patience=patience))
+    if chosen["precision"] not in ("64-true", "64", 64):
+        raise ValueError(
+            f"trainer: expected precision 64-true, as sticking is judged at 1e-12 m/s, got {chosen['precision']}"
+        )
+    if chosen["accelerator"] in ("cuda", "gpu") and not torch.cuda.is_available():
+        raise ValueError("torch finds no CUDA device here: use trainer=cpu (trainer={'accelerator': 'cpu'}).")
     with _trainer_errors():
         lightning_trainer = pl.Trainer(
             default_root_dir=folder, callbacks=callbacks, logger=logger or False, num_sanity_val_steps=0,

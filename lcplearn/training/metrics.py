@@ -152,7 +152,8 @@ def describe_model(model: Formulation, data: BlockData) -> str:
     parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
     dtype = str(next(model.parameters()).dtype).removeprefix("torch.")
     steps = int(data.train.steps.sum())
-    return f"{type(model).__name__}: {parameters} parameters ({dtype}); {data.kind}: {steps} training steps"
+    counted = f"{parameters} parameter{'s' * (parameters != 1)}"
+    return f"{type(model).__name__}: {counted} ({dtype}); {data.kind}: {steps} training steps"
 
 
 def _stops(model: Formulation, slides: Recordings) -> dict[str, float | None]:

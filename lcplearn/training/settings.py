@@ -5,6 +5,7 @@ Settings are plain dictionaries here: only train.py knows Hydra. What a `_target
 
 import ast
 import difflib
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
@@ -17,6 +18,10 @@ import yaml
 LOSS_TERMS = ("prediction", "rollout", "complementarity", "nonnegativity", "violation")
 TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
 FROM_DATA = {"dt", "gravity"}  # of a model, which takes them from its data
+UNLIKELY = {"min_epochs"}  # what nobody means who writes something alike
+# Ranges that the targets check too, seconds later: of data, model and optimizer.
+POSITIVE = {"dt", "mass", "trajectories", "length", "width", "initial_mass", "lr", "lbfgs_iterations", "shift"}
+AT_LEAST_0 = {"noise", "mu", "depth", "initial_noise", "initial_mu", "lbfgs_after", "anneal_epochs"}
 TYPES = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,), "None": (type(None),), "Path": (str,)}
 
 
@@ -37,7 +42,8 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
         SettingsError: the first mistake found.
     """
     for key in settings:
-        _known(key, _vocabulary(conf, "")[0], "setting")
+        if key not in _vocabulary(conf, "")[0]:
+            raise SettingsError(_unknown(key, conf))
     for key, kind in (("seed", "int"), ("threads", "int"), ("batch_size", "int | None"), ("patience", "int | None")):
         _check_type(key, settings.get(key), kind)
     if settings["threads"] < 1:
@@ -52,12 +58,19 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
             _check_target(group, settings[group])
     if settings["batch_size"] is not None and settings["optimizer"].get("lbfgs_after") is not None:
         raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
+    _check_ranges(settings)
     _check_loss(settings["loss"])
+    length, horizon = settings["data"].get("length"), settings["loss"].get("horizon", 1)
+    if length is not None and horizon > length:
+        raise SettingsError(f"loss.horizon={horizon} is longer than the recordings: data.length={length}.")
     _check_arguments("trainer", settings["trainer"], TRAINER)
     for key in ("max_epochs", "check_val_every_n_epoch"):
         epochs = settings["trainer"].get(key, 1)
         if epochs is None or epochs < 1:
             raise SettingsError(f"trainer.{key} must be at least 1, got {epochs}.")
+    if settings["trainer"].get("precision", "64-true") not in ("64-true", "64", 64):
+        precision = settings["trainer"]["precision"]
+        raise SettingsError(f"trainer.precision must be 64-true, as sticking is judged at 1e-12 m/s; got {precision}.")
     _check_processes(settings["trainer"], multirun, processes)
     _check_checkpoint(settings.get("ckpt_path"))
 
@@ -83,6 +96,9 @@ def _check_processes(trainer: Mapping[str, Any], multirun: bool, processes: int)
     """Several processes train together, and none starts the sweep again."""
     strategy, devices = str(trainer.get("strategy", "auto")), trainer.get("devices", 1)
     count = len(devices) if isinstance(devices, list) else devices  # a list names them
+    cores = os.cpu_count() or 1
+    if trainer.get("accelerator") == "cpu" and isinstance(count, int) and count > cores:
+        raise SettingsError(f"trainer.devices={count} would start {count} processes on {cores} cores.")
     forks = strategy.startswith(("ddp_fork", "ddp_spawn"))
     starts_again = not forks and (strategy.startswith("ddp") or count != 1)  # Lightning's auto is ddp for several
     if multirun and starts_again:
@@ -96,6 +112,17 @@ def _check_processes(trainer: Mapping[str, Any], multirun: bool, processes: int)
             f"torchrun started {processes} processes: set trainer.strategy=ddp and trainer.devices={processes}, "
             "or on several nodes each one's trainer.devices and +trainer.num_nodes."
         )
+
+
+def _check_ranges(settings: Mapping[str, Any]) -> None:
+    for group in ("data", "model", "optimizer"):
+        for key, value in settings[group].items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            if key in POSITIVE and not 0 < value < float("inf"):
+                raise SettingsError(f"{group}.{key} must be positive, got {value}.")
+            if key in AT_LEAST_0 and not 0 <= value < float("inf"):
+                raise SettingsError(f"{group}.{key} must be at least 0, got {value}.")
 
 
 def _check_friction(settings: Mapping[str, Any]) -> None:
@@ -233,9 +260,34 @@ def explain(message: str, conf: Path) -> str:
         in_files, in_code = _vocabulary(conf, group)
         if key in in_code and key not in in_files:
             return f"'{unknown[1]}' is not set in conf/{group}; to add it, write +{unknown[1]}=..."
-        prefix = f"{group}." if group else ""
-        return f"Unknown setting '{unknown[1]}'; {_suggestion(key, in_files | in_code, prefix)}"
+        if not group:
+            return _unknown(key, conf)
+        if key in in_files:
+            return f"'{unknown[1]}' is a setting of another {group}= than the chosen one."
+        return f"Unknown setting '{unknown[1]}'; {_suggestion(key, in_files | in_code, f'{group}.')}"
+    several = re.search(r"Ambiguous value for argument '([^']+)'", message)
+    if several:
+        return f"{several[1]} are several values: -m before the settings trains one run after the other."
+    unread = re.search(r"Error parsing override '(.*?)'", message)
+    if unread:
+        return f"'{unread[1]}' is no setting: write key=value, and in quotes what has special characters."
     return " ".join(message.split())  # Hydra breaks its lines
+
+
+def _unknown(key: str, conf: Path) -> str:
+    """A key that does not stand at the top level, but maybe in a group."""
+    top = _vocabulary(conf, "")[0]
+    groups = sorted(folder.name for folder in conf.iterdir() if folder.is_dir() and folder.name != "experiment")
+    below = {f"{group}.{name}" for group in groups for names in _vocabulary(conf, group) for name in names}
+    exact = sorted(name for name in below if name.partition(".")[2] == key)
+    if exact:
+        return f"Unknown setting '{key}'; did you mean {' or '.join(map(repr, exact))}?"
+    if not difflib.get_close_matches(key, top, n=1, cutoff=0.5):
+        names = {name.partition(".")[2]: name for name in below if name.partition(".")[2] not in UNLIKELY}
+        close = difflib.get_close_matches(key, names, n=1, cutoff=0.7)
+        if close:
+            return f"Unknown setting '{key}'; did you mean '{names[close[0]]}'?"
+    return f"Unknown setting '{key}'; {_suggestion(key, top)}"
 
 
 def _vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:

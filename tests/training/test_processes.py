@@ -42,14 +42,15 @@ def test_runs_side_by_side_train_as_one_by_one_end_with_the_comparison_and_resum
     done = train(tmp_path, "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model=affine,physical", *SHORT)
     assert done.returncode == 0, done.stderr
     assert not noise(done.stderr)
-    (folder,) = (tmp_path / "runs").iterdir()
-    assert {path.name for path in folder.iterdir()} == {"0", "1", "compare.md", "compare.png", "multirun.yaml"}
+    (folder,) = (tmp_path / "runs").glob("*_sweep")
+    runs = ["0_model=affine", "1_model=physical"]
+    assert {path.name for path in folder.iterdir()} == {*runs, "compare.md", "compare.png", "multirun.yaml"}
     table = (folder / "compare.md").read_text()
     assert table in done.stdout
     assert table.count("Affine") == table.count("Physical") == 1
-    figures = json.loads((folder / "1" / "metrics.json").read_text())
+    figures = json.loads((folder / runs[1] / "metrics.json").read_text())
     assert figures["velocity_rmse"] == pytest.approx(error, rel=1e-6)
-    last = folder / "1" / "last.ckpt"
+    last = folder / runs[1] / "last.ckpt"
     more = {"epochs": 5, "optimizer": Optimizer(lbfgs_after=2), "ckpt_path": last}
     resumed = short_fit(lcplearn.load(last).train(), data, tmp_path / "resumed", **more)
     assert resumed.metrics is not None

@@ -31,16 +31,17 @@ def test_a_sweep_over_two_processes_each_trains_as_one_would_and_ends_with_the_c
     done = train(tmp_path, "-m", "model=affine,physical", "trainer.max_epochs=3", "optimizer.lbfgs_after=2",
                  "trainer.strategy=ddp_fork", "trainer.devices=2", *SMALL)  # fmt: skip
     assert done.returncode == 0, done.stderr
-    (folder,) = (tmp_path / "runs").iterdir()
-    assert {path.name for path in folder.iterdir()} >= {"0", "1", "compare.md", "compare.png"}
-    for number, model in enumerate(("Affine", "Physical")):
-        assert len(list((folder / str(number)).glob("metrics.json"))) == 1
-        config = yaml.safe_load((folder / str(number) / "config.yaml").read_text())
+    folder = (tmp_path / "runs" / "latest").resolve()
+    runs = ["0_model=affine", "1_model=physical"]
+    assert {path.name for path in folder.iterdir()} >= {*runs, "compare.md", "compare.png"}
+    for run, model in zip(runs, ("Affine", "Physical"), strict=True):
+        assert len(list((folder / run).glob("metrics.json"))) == 1
+        config = yaml.safe_load((folder / run / "config.yaml").read_text())
         assert config["model"]["_target_"].endswith(model)
         assert model in (folder / "compare.md").read_text()
     data = simulate_sliding_block(trajectories=4, length=30, long_length=20)
     alone = short_fit(Physical(dt=data.dt), data, tmp_path / "alone", epochs=3, optimizer=Optimizer(lbfgs_after=2))
-    together = json.loads((folder / "1" / "metrics.json").read_text())
+    together = json.loads((folder / runs[1] / "metrics.json").read_text())
     assert alone.metrics is not None
     assert together["velocity_rmse"] == pytest.approx(alone.metrics["velocity_rmse"], rel=1e-6)
     noise = [line for line in done.stderr.splitlines() if line and "epoch" not in line]
@@ -71,3 +72,17 @@ def test_a_run_says_what_it_does_and_where_it_put_it(tmp_path: Path) -> None:
     assert re.search(r"velocity_rmse\s+" + re.escape(f"{metrics['velocity_rmse']:.4g}"), done.stdout)
     assert (folder / ".hydra" / "overrides.yaml").is_file()
     assert list((folder / "tensorboard").glob("events*"))
+
+
+def test_a_run_of_a_sweep_that_diverges_leaves_an_empty_row_and_the_sweep_goes_on(tmp_path: Path) -> None:
+    done = train(
+        tmp_path, "-m", "optimizer=adam", "optimizer.lr=1e200,0.05", "model=mlp", "trainer.max_epochs=3", *SMALL
+    )
+    assert done.returncode == 0, done.stderr
+    assert (
+        "Training diverged in epoch 1: the error on the validation data is not finite; lower optimizer.lr"
+        in done.stdout
+    )
+    rows = (tmp_path / "runs" / "latest" / "compare.md").read_text().splitlines()[2:]
+    assert [row.split("|")[3].strip() for row in rows] == ["0 of 1", "1 of 1"]
+    assert not rows[1].split("|")[4].strip()
