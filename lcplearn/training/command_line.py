@@ -69,18 +69,31 @@ def prepare(arguments: Sequence[str], conf: Path) -> Command:
 
 
 def settle(folder: Path | None) -> None:
-    """Point runs/latest to a folder in which something was trained; take one away in which nothing was."""
+    """Make runs/latest links to a folder in which something was trained; take one away in which nothing was."""
     if folder is None or not folder.is_dir():
         return
     files = [path for path in folder.rglob("*") if path.is_file()]
     if all(path.name == "multirun.yaml" or path.parent.name == ".hydra" for path in files):
         shutil.rmtree(folder)
         return
-    latest = folder.with_name("latest")
-    if latest.is_symlink() or not latest.exists():
-        beside = folder.with_name(f".latest.{folder.name}")
-        beside.symlink_to(folder.name)
-        beside.replace(latest)
+    _link(folder, folder.with_name("latest"))
+
+
+def _link(folder: Path, latest: Path) -> None:
+    """Make `latest` a folder of links to the files of a run or sweep.
+
+    No link to the folder itself: TensorBoard follows those, and would show each run twice. So events stay out of it.
+    """
+    if latest.exists() and not all(path.is_symlink() or path.is_dir() for path in latest.rglob("*")):
+        return  # somebody keeps files of their own there
+    beside = latest.with_name(f".latest.{folder.name}")
+    for path in folder.rglob("*"):
+        below = path.relative_to(folder)
+        if path.is_file() and not {".hydra", "tensorboard"} & set(below.parts):
+            (beside / below).parent.mkdir(parents=True, exist_ok=True)
+            (beside / below).symlink_to(Path(*[".."] * len(below.parts), folder.name, below))
+    shutil.rmtree(latest, ignore_errors=True)
+    beside.rename(latest)
 
 
 def version_line() -> str:

@@ -71,13 +71,20 @@ def test_a_folder_without_a_run_goes_and_latest_is_the_last_with_one() -> None:
     first, second, third = folders
     for folder in (first, second):
         assert folder is not None
-        (folder / "last.ckpt").write_text(folder.name)
+        (folder / "0").mkdir()
+        (folder / "0" / "last.ckpt").write_text(folder.name)
+        (folder / "0" / "tensorboard").mkdir()
+        (folder / "0" / "tensorboard" / "events").touch()
         settle(folder)
     settle(third)
     assert third is not None
     assert not third.exists()
     assert second is not None
-    assert Path("runs/latest/last.ckpt").read_text() == second.name
+    assert Path("runs/latest/0/last.ckpt").read_text() == second.name
+    assert [path.name for path in Path("runs/latest").rglob("*") if not path.is_dir()] == ["last.ckpt"]  # no events
+    Path("runs/latest/mine").touch()
+    settle(first)
+    assert Path("runs/latest/mine").is_file()
 
 
 def test_nothing_here_imports_torch() -> None:

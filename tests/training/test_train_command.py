@@ -31,7 +31,7 @@ def test_a_sweep_over_two_processes_each_trains_as_one_would_and_ends_with_the_c
     done = train(tmp_path, "-m", "model=affine,physical", "trainer.max_epochs=3", "optimizer.lbfgs_after=2",
                  "trainer.strategy=ddp_fork", "trainer.devices=2", *SMALL)  # fmt: skip
     assert done.returncode == 0, done.stderr
-    folder = (tmp_path / "runs" / "latest").resolve()
+    (folder,) = (tmp_path / "runs").glob("*_sweep")
     runs = ["0_model=affine", "1_model=physical"]
     assert {path.name for path in folder.iterdir()} >= {*runs, "compare.md", "compare.png"}
     for run, model in zip(runs, ("Affine", "Physical"), strict=True):
