@@ -4,7 +4,7 @@ A scene gives gaps, Jacobians and a free velocity; `contact_step` finds the velo
 for contacts that close, checks the others afterwards, and adds what it was wrong about. Nothing here knows of shapes.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,9 +13,11 @@ from torch import Tensor
 from lcplearn.scenes.friction_lcp import ROUNDING, Answer, Problem, cone_lcp, frictionless_lcp, polygon_lcp
 from lcplearn.scenes.scene import Mode
 
-MAX_ITERATIONS = 40  # of the cone's fixed point; the mean is about 2
+MAX_ITERATIONS = 40  # of the cone's fixed point; the mean is about 3
 SETTLED = 1e-10  # change of velocity from one iterate to the next, relative to the free velocity, in the mass norm
 DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
+
+RestitutionLaw = Literal["newton", "continuous"]
 
 
 class Contacts(NamedTuple):
@@ -26,7 +28,7 @@ class Contacts(NamedTuple):
         normal: Jacobian of the normal speed, positive where the gap opens.
         tangents: Jacobians of the slip along T orthonormal directions.
         mu: Friction coefficient; >= 0.
-        bounce: Normal speed that restitution asks for [m/s]; >= 0. See `closing_speed`.
+        bounce: What restitution asks for beyond using up the gap [m/s]; >= 0. See `rebound`.
         compliance: Normal speed by which a unit of normal impulse may sink [1/kg]; >= 0. It makes the split of forces
             among redundant contacts unique. Where a body slides and spins on four coplanar corners the split decides
             the velocity, too. 1e-6 to 1e-3 of 1 / mass; at rest a contact then lies compliance * dt * impulse deep.
@@ -35,9 +37,9 @@ class Contacts(NamedTuple):
     gap: Float[Tensor, "*#batch C"]
     normal: Float[Tensor, "*#batch C nv"]
     tangents: Float[Tensor, "*#batch C T nv"]
-    mu: Float[Tensor, "*#batch C"]
-    bounce: Float[Tensor, "*#batch C"]
-    compliance: Float[Tensor, "*#batch C"]
+    mu: Float[Tensor, "*#batch #C"]
+    bounce: Float[Tensor, "*#batch #C"]
+    compliance: Float[Tensor, "*#batch #C"]
 
 
 class ContactStep(NamedTuple):
@@ -67,25 +69,40 @@ def closing_speed(
     before: Float[Tensor, "*#batch C"],
     free: Float[Tensor, "*#batch C"],
     dt: float,
-    *,
-    continuous: bool = True,
+    law: RestitutionLaw,
 ) -> Float[Tensor, "..."]:
     """Speed of an impact [m/s], of which a contact gives back restitution times as much.
-
-    Newton's law takes the speed before the step, -before, of every contact that would close, gap + dt free < 0. It
-    jumps where a contact begins to close. The continuous variant takes the part of the speed that is left when the gap
-    is used up, max(0, -before - max(gap, 0) / dt).
 
     Args:
         gap: [m].
         before: Normal speed before the step [m/s].
         free: Normal speed after the step if nothing touched [m/s].
         dt: Step size [s].
-        continuous: Which of the two.
+        law: "newton" is the speed before the step, -before, of a contact that would close; it jumps where a contact
+            begins to. "continuous" is the part of it that is left when the gap is used up, -before - max(gap, 0) / dt.
     """
-    if continuous:
+    if law == "continuous":
         return torch.relu(-before - torch.relu(gap) / dt)
     return torch.where(gap + dt * free < 0.0, torch.relu(-before), 0.0)
+
+
+def rebound(
+    gap: Float[Tensor, "*#batch C"],
+    closing: Float[Tensor, "*#batch C"],
+    restitution: Float[Tensor, "*#batch #C"],
+    dt: float,
+    law: RestitutionLaw,
+) -> Float[Tensor, "..."]:
+    """`Contacts.bounce` [m/s] for a closing speed.
+
+    By "newton" the normal speed after an impact is restitution * closing, wherever in the step it falls: right speeds
+    and heights. By "continuous" the gap after it is dt * restitution * closing: right positions, but on average a body
+    rebounds slower than restitution says.
+    """
+    bounce = restitution * closing
+    if law == "continuous":
+        return bounce
+    return torch.where(bounce > 0.0, torch.relu(bounce + gap / dt), 0.0)
 
 
 def contact_step(
@@ -203,7 +220,7 @@ def _iterate(part: Problem) -> Answer:
     guess = Answer.guess(part)
     result, todo = guess.clone(), torch.arange(len(part.free), device=part.free.device)
     scale = part.mass_norm(part.free)
-    old = torch.full_like(scale, torch.inf)
+    old, was_damped = torch.full_like(scale, torch.inf), torch.zeros_like(guess.solved)
     for iteration in range(MAX_ITERATIONS):
         new = cone_lcp(part, guess)
         change = part.mass_norm(new.velocity - guess.velocity)
@@ -212,10 +229,11 @@ def _iterate(part: Problem) -> Answer:
         going = torch.nonzero(~(new.settled & new.solved))[:, 0]
         if not len(going):
             break
-        # Undamped, 1 to 3 in 100 cycle.
-        damped = (change > 0.3 * old) & (iteration > 3)
+        # A step in two at most is halved, against cycles: always halved, the iterates would converge no faster.
+        damped = (change > 0.3 * old) & (iteration > 3) & ~was_damped
         guess = guess.toward(new, torch.where(damped, 0.5, 1.0)).pick(going)
-        part, todo, scale, old = part.pick(going), todo[going], scale[going], change[going]
+        part, todo, scale = part.pick(going), todo[going], scale[going]
+        old, was_damped = change[going], damped[going]
     return result
 
 

@@ -4,9 +4,9 @@
 
     |f_t| <= mu lambda,     f_s = -weight v_s,     weight = mu lambda / |slip|,
 
-with slip and load of the iterate before. Where the iterate's facet sticks, t is along the friction force, and a slip of
-`CREEP` takes the slip's place in the weight. At the fixed point v_s = 0 (slip) or f_s = 0 (stick), so that this is
-Coulomb's law, and its derivative: what changes the weight multiplies v_s = 0.
+with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is a few times `CREEP`, t is
+along the friction force, and the slip in the weight is at least `CREEP`. At the fixed point v_s = 0 (slip) or f_s = 0
+(stick), so that this is Coulomb's law, and its derivative: what changes the weight multiplies v_s = 0.
 
 f_s is condensed out of the Delassus matrix A = J mass^-1 J', and the facets make the rows lambda, a, sigma:
 
@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from lcplearn.lcp.solve import solve_lcp
+from lcplearn.scenes.numbers import matvec
 
 ROUNDING = 1e-13  # of speeds, relative to those of free flight
 CREEP = 1e-8  # speed that stands for the slip at stick, likewise
@@ -57,7 +58,7 @@ class Problem(NamedTuple):
 
     def excess(self, velocity: Tensor) -> Tensor:
         """Normal speed of each contact beyond its target."""
-        return _times(self.normal, velocity) - self.target
+        return matvec(self.normal, velocity) - self.target
 
     def mass_norm(self, velocity: Tensor) -> Tensor:
         """sqrt(v' mass v), the same unit for translation and rotation."""
@@ -94,7 +95,7 @@ class Answer(NamedTuple):
         answer = Answer.free_flight(problem)
         alone = (problem.normal.square() / problem.mass.unsqueeze(-2)).sum(-1)
         load = torch.relu(-problem.excess(problem.free)) / alone
-        return answer._replace(normal=load, slip=_times(problem.tangents, problem.free.unsqueeze(-2)))
+        return answer._replace(normal=load, slip=matvec(problem.tangents, problem.free.unsqueeze(-2)))
 
     def clone(self) -> "Answer":
         return Answer._make(x.clone() for x in self)
@@ -127,7 +128,7 @@ def frictionless_lcp(problem: Problem) -> Answer:
     A, speed, response = _delassus(problem, problem.normal)
     M = A + torch.diag_embed(problem.compliance)
     solution = solve_lcp(M, speed - problem.target)
-    velocity = problem.free + _times(response.mT, solution.z)
+    velocity = problem.free + matvec(response.mT, solution.z)
     none = torch.zeros_like(problem.tangents[..., 0])
     return Answer(velocity, solution.z, none, none, solution.z < 0.0, solution.solved, solution.solved)
 
@@ -151,7 +152,7 @@ def cone_lcp(problem: Problem, guide: Answer | None) -> Answer:
             root.unsqueeze(-1) * sources, torch.linalg.cholesky_ex(inner)[0]
         )
         A_rows, A_across = A[:, : 2 * K, : 2 * K], A[:, : 2 * K, 2 * K :]
-        A, speed = A_rows - A_across @ across[..., :-1], speed[:, : 2 * K] - _times(A_across, across[..., -1])
+        A, speed = A_rows - A_across @ across[..., :-1], speed[:, : 2 * K] - matvec(A_across, across[..., -1])
     # columns lambda and a instead of lambda and f_t = a - mu lambda
     facets = torch.cat((A[..., :K] - A[..., K:] * mu.unsqueeze(-2), A[..., K:]), dim=-1)
     zero, one = torch.zeros_like(eye).expand(len(A), K, K), eye.expand(len(A), K, K)
@@ -170,9 +171,9 @@ def cone_lcp(problem: Problem, guide: Answer | None) -> Answer:
     forces = [normal, a - mu * normal]
     slips = [slip_along]
     if problem.directions == 2:
-        forces.append(-_times(across[..., :-1], torch.cat(forces, dim=-1)) - across[..., -1])
+        forces.append(-matvec(across[..., :-1], torch.cat(forces, dim=-1)) - across[..., -1])
         slips.append(-forces[2] / torch.where(weight > 0.0, weight, 1.0))
-    velocity = problem.free + _times(response.mT, torch.cat(forces, dim=-1))
+    velocity = problem.free + matvec(response.mT, torch.cat(forces, dim=-1))
     friction = (torch.stack(forces[1:], dim=-1).unsqueeze(-2) @ axes).squeeze(-2)
     slip = (torch.stack(slips, dim=-1).unsqueeze(-2) @ axes).squeeze(-2)
     return Answer(velocity, normal, friction, slip, slip_along == 0.0, solution.solved, solution.solved)
@@ -195,9 +196,9 @@ def polygon_lcp(problem: Problem, k: int) -> Answer:
     q = torch.cat((speed[:, :K] - problem.target, speed[:, K:], torch.zeros_like(problem.mu)), dim=-1)
     solution = solve_lcp(M, q)
     z = solution.z
-    velocity = problem.free + _times(response.mT, z[:, :size])
+    velocity = problem.free + matvec(response.mT, z[:, :size])
     friction = z[:, K:size].unflatten(-1, (K, count)) @ angles
-    slip = _times(problem.tangents, velocity.unsqueeze(-2))
+    slip = matvec(problem.tangents, velocity.unsqueeze(-2))
     return Answer(velocity, z[:, :K], friction, slip, z[:, size:] == 0.0, solution.solved, solution.solved)
 
 
@@ -206,12 +207,15 @@ def _facets(problem: Problem, guide: Answer | None) -> tuple[Tensor, Tensor]:
     if guide is None:
         raise ValueError("guide: expected an iterate, got None")
     with torch.no_grad():
-        scale = CREEP * problem.speed_scale()
-        direction = torch.where(guide.sticks.unsqueeze(-1), -guide.friction, guide.slip)
+        slip = torch.linalg.vector_norm(guide.slip, dim=-1)
+        creep = CREEP * problem.speed_scale()
+        # A slip as small as what a weight leaves over has no direction worth following.
+        sticks = guide.sticks | (slip <= 10.0 * creep)
+        direction = torch.where(sticks.unsqueeze(-1), -guide.friction, guide.slip)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         some = length > 0.0
         t = torch.where(some, direction / torch.where(some, length, 1.0), direction.new_tensor([1.0, 0.0]))
-        speed = torch.maximum(torch.where(guide.sticks, 0.0, length[..., 0]), scale)
+        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), creep)
         s = torch.stack((-t[..., 1], t[..., 0]), dim=-1)
         weight = torch.where(speed > 0.0, problem.mu * guide.normal / torch.where(speed > 0.0, speed, 1.0), 0.0)
         return torch.stack((t, s), dim=-2), weight
@@ -220,8 +224,4 @@ def _facets(problem: Problem, guide: Answer | None) -> tuple[Tensor, Tensor]:
 def _delassus(problem: Problem, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """J mass^-1 J', J free and mass^-1 J' (transposed) for Jacobian rows J [B, R, nv]."""
     response = rows / problem.mass.unsqueeze(-2)
-    return rows @ response.mT, _times(rows, problem.free), response
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+    return rows @ response.mT, matvec(rows, problem.free), response

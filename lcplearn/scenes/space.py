@@ -91,6 +91,7 @@ class Space:
 
 
 LINE = Space(positions=("position_m",), velocities=("velocity_m_s",))
+TABLE = Space(positions=("x_m", "y_m"), velocities=("x_velocity_m_s", "y_velocity_m_s"))
 PLANE = Space(
     positions=("x_m", "y_m", "angle_rad"),
     velocities=("x_velocity_m_s", "y_velocity_m_s", "angular_velocity_rad_s"),

@@ -8,11 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.scenes.checks import require_positive
-from lcplearn.scenes.contact import Contacts, closing_speed, contact_step
+from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, contact_step, rebound
+from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Step
 from lcplearn.scenes.space import POSE, Space, rotation_matrix
-
-Number = float | Tensor  # a tensor broadcasts over the batch, and may need a gradient
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class SpatialBody:
         ground: Height of the ground [m].
         gravity: Downward acceleration [m/s^2], or the vector of it [3], for a slope.
         compliance: Of a contact, times mass (see `Contacts`).
-        continuous: The continuous variant of Newton's restitution, or the plain one.
+        restitution_law: See `rebound`.
         polygon: None is the exact friction cone; k is a polygon of 2 k directions.
         rest: Whether rest is written as 0 (see `contact_step`).
 
@@ -60,7 +59,7 @@ class SpatialBody:
     ground: Number = 0.0
     gravity: Number = 9.81
     compliance: Number = 0.0
-    continuous: bool = True
+    restitution_law: RestitutionLaw = "newton"
     polygon: int | None = None
     rest: bool = True
 
@@ -98,10 +97,10 @@ class SpatialBody:
     def _mass(self, like: Tensor) -> Tensor:
         """Diagonal of the mass matrix [*batch, 6]."""
         inertia = self.inertia if isinstance(self.inertia, tuple) else (self.inertia,) * 3
-        return _stack(self.mass, self.mass, self.mass, *inertia, like=like)
+        return stack_numbers(self.mass, self.mass, self.mass, *inertia, like=like)
 
     def _free_velocity(self, velocity: Tensor, turn: Tensor, force: Tensor, mass: Tensor) -> Tensor:
-        gravity = _tensor(self.gravity, velocity)
+        gravity = as_tensor(self.gravity, velocity)
         if gravity.shape[-1:] != (3,):
             gravity = torch.stack((torch.zeros_like(gravity), torch.zeros_like(gravity), -gravity), dim=-1)
         linear = velocity[..., :3] + self.dt * (gravity + force[..., :3] / mass[..., :3])
@@ -114,7 +113,7 @@ class SpatialBody:
     def _contacts(self, position: Tensor, before: Tensor, free: Tensor, turn: Tensor) -> Contacts:
         corners = self.corners.to(position)
         radius, ground, mu, restitution = (
-            _tensor(x, position).unsqueeze(-1) for x in (self.radius, self.ground, self.mu, self.restitution)
+            as_tensor(x, position).unsqueeze(-1) for x in (self.radius, self.ground, self.mu, self.restitution)
         )
         centres = corners @ turn.mT
         gap = position[..., 2:3] + centres[..., 2] - radius - ground
@@ -123,17 +122,17 @@ class SpatialBody:
         linear = torch.eye(3, dtype=position.dtype, device=position.device).expand(*lever.shape[:-1], 3, 3)
         angular = torch.linalg.cross(*torch.broadcast_tensors(lever.unsqueeze(-2), turn.unsqueeze(-3)))
         x, y, normal = torch.cat(torch.broadcast_tensors(linear, angular), dim=-1).unbind(-2)
-        closing = closing_speed(gap, _times(normal, before), _times(normal, free), self.dt, continuous=self.continuous)
+        closing = closing_speed(gap, matvec(normal, before), matvec(normal, free), self.dt, self.restitution_law)
         if self.mu_impact is not None:
             share = torch.clamp(closing / self.impact_speed, max=1.0)
-            mu = mu + (_tensor(self.mu_impact, position).unsqueeze(-1) - mu) * share
-        compliance = _tensor(self.compliance, position) / _tensor(self.mass, position)
+            mu = mu + (as_tensor(self.mu_impact, position).unsqueeze(-1) - mu) * share
+        compliance = as_tensor(self.compliance, position) / as_tensor(self.mass, position)
         return Contacts(
             gap=gap,
             normal=normal,
             tangents=torch.stack((x, y), dim=-2),
             mu=mu,
-            bounce=restitution * closing,
+            bounce=rebound(gap, closing, restitution, self.dt, self.restitution_law),
             compliance=compliance.unsqueeze(-1),
         )
 
@@ -167,15 +166,3 @@ def _cross_matrix(a: Tensor) -> Tensor:
     o = torch.zeros_like(x)
     rows = ((o, -z, y), (z, o, -x), (-y, x, o))
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-def _tensor(value: Number, like: Tensor) -> Tensor:
-    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=like.dtype, device=like.device)
-
-
-def _stack(*values: Number, like: Tensor) -> Tensor:
-    return torch.stack(torch.broadcast_tensors(*(_tensor(x, like) for x in values)), dim=-1)

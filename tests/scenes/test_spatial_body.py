@@ -42,7 +42,7 @@ def tossed(count: int, seed: int = 0) -> Tensor:
 def test_a_tossed_box_loses_energy_never_penetrates_and_comes_to_exact_rest():
     scene = body()
     with torch.no_grad():
-        path = rollout(scene, tossed(20), Drive(torch.zeros(20, 150, 6)))
+        path = rollout(scene, tossed(8), Drive(torch.zeros(8, 120, 6)))
     inertia = torch.tensor([0.4] * 3 + [0.0011, 0.001, 0.0008])
     energy = (inertia * path.velocities.square()).sum(-1) / 2 + 0.4 * 9.81 * path.positions[..., 2]
     assert (energy[:, 1:] <= energy[:, :-1] + 1e-12).all()
@@ -52,20 +52,20 @@ def test_a_tossed_box_loses_energy_never_penetrates_and_comes_to_exact_rest():
     assert (corners[:, 1:].amin(-1) >= -turned.cummax(-1).values[:, 1:] - 1e-12).all()
     assert (path.velocities[:, -1] == 0.0).all()
     assert (path.mode[:, -1] == Mode.STICK).sum(-1).ge(2).all()
-    assert path.solved.double().mean() >= 0.998
+    assert path.solved.all()
 
 
 def test_gradients_of_a_step_are_those_of_differences():
     names = ("mu", "mass", "radius", "restitution", "ground", "mu_impact")
     value = torch.tensor([0.3, 0.4, 0.004, 0.2, 0.002, 0.2])
-    state = tossed(60, seed=1)
-    weights = torch.randn(60, 13, generator=torch.Generator().manual_seed(3))
+    state = tossed(40, seed=1)
+    weights = torch.randn(40, 13, generator=torch.Generator().manual_seed(3))
 
     def outcome(parameters: Tensor) -> Tensor:
         scene = body(**dict(zip(names, parameters.unbind(-1), strict=True)), compliance=1e-3)
         return (weights * scene.advance(state, NOTHING).state).sum(-1)
 
-    parameters = value.expand(60, 6).clone().requires_grad_()
+    parameters = value.expand(40, 6).clone().requires_grad_()
     gradient = torch.autograd.grad(outcome(parameters).sum(), parameters)[0]
     with torch.no_grad():
         steps = [(h, h * torch.eye(6)) for h in (1e-5, 1e-6)]
@@ -83,9 +83,9 @@ def test_a_box_rests_exactly(slope):
     scene = body(gravity=gravity, mu=0.3)
     state = REST
     with torch.no_grad():
-        for _ in range(50):
+        for _ in range(20):
             step = scene.advance(state, NOTHING)
-            assert (step.state == REST).all()
+            assert (step.state == REST).all()  # a fixed point: what 20 steps leave as it is, 10,000 do
             state = step.state
 
 
