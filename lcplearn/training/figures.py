@@ -132,12 +132,13 @@ def error_over_horizon(model: Formulation, data: BlockData) -> "Figure":
     error = (velocity - truth(recordings))[:, 1:].abs()
     known = valid_steps(recordings)
     error = torch.where(known, error, 0.0)
-    error = torch.where(error < 1e12, error, torch.inf)  # drawn up to where it diverges
+    error = error.nan_to_num(nan=1e12).clamp(max=1e12)  # more is not drawn: it has diverged
     rms = (error.square().sum(0) / known.sum(0).clamp(min=1)).sqrt()
     steps = torch.arange(1, len(rms) + 1)
     ax = axes[0][0]
     floor = 1e-17  # exact zeros, which a logarithmic axis can't show
-    ax.axhline(ROUNDING, color="0.8", linewidth=0.8, linestyle=":", label="rounding")
+    if float(rms.min()) < 1e3 * ROUNDING:  # else it would only stretch the axis
+        ax.axhline(ROUNDING, color="0.5", linewidth=0.8, linestyle=":", label="rounding")
     ax.plot(steps, error.amax(0).clamp(min=floor), color="0.6", linewidth=1.0, label="largest")
     ax.plot(steps, rms.clamp(min=floor), label="root mean square", **LEARNED)
     ax.set(xscale="log", yscale="log", xlabel="steps since the start", ylabel="velocity error [m/s]")

@@ -212,16 +212,17 @@ def _hyperparameters(module: FormulationModule, used: Mapping[str, Any], epochs:
     described = module.described
     arguments = {name: value for name, value in described["formulation"]["arguments"].items() if name not in FROM_DATA}
     weights = described["objective"]["loss"]
+    # TensorBoard sorts them by name and shows the first five: numbers make these the five that matter.
     return {
-        "model": described["formulation"]["class"].rpartition(".")[2],
-        "seed": used["seed"],
-        "noise": used["data"].get("noise", ""),
-        "lr": used["optimizer"]["lr"],
-        "epochs": epochs,
-        "loss": " ".join(f"{name}={weight:g}" for name, weight in weights.items()),
-        "horizon": module.horizon,
+        "1 model": described["formulation"]["class"].rpartition(".")[2],
+        "2 seed": used["seed"],
+        "3 noise": used["data"].get("noise", ""),
+        "4 lr": used["optimizer"]["lr"],
+        "5 epochs": epochs,
         "batch_size": used["batch_size"] or "all",
-        "arguments": " ".join(f"{name}={value}" for name, value in arguments.items()),
+        "horizon": module.horizon,
+        "loss": " ".join(f"{name}={weight:g}" for name, weight in weights.items()),
+        "model arguments": " ".join(f"{name}={value}" for name, value in arguments.items()),
     }
 
 

@@ -42,7 +42,7 @@ def leave(
     pictures = figures.draw(model, data)
     for name, figure in pictures.items():
         # Pictures are looked at side by side and far from their folder.
-        figure.suptitle(f"{type(model).__name__}   {folder.name}", x=0.01, ha="left", fontsize=8, color="0.4")
+        figure.suptitle(f"{type(model).__name__}   {folder.name}", fontsize=11)
         figure.savefig(folder / f"{name}.png", dpi=120)
     _log(trainer, metrics, used, pictures)
     return metrics

@@ -182,3 +182,15 @@ def test_a_wrong_argument_is_named(name, arguments):
     # a wrong literal is a TypeError first where the tests check types
     with pytest.raises((ValueError, TypeError), match=name):
         simulate_sliding_block(**arguments)
+
+
+@pytest.mark.parametrize("simulate", [simulate_sliding_block, simulate_falling_block])
+def test_no_split_holds_a_recording_of_another(simulate):
+    data = simulate()
+    parts = [part for part in (data.train, data.validation, data.test, data.test_long) if part is not None]
+    drawn = [part.true_velocities[:, :20] for part in parts]
+    for k, ours in enumerate(drawn):
+        for theirs in drawn[k + 1 :]:
+            moving = (ours != 0).any(1)
+            same = (ours[moving][:, None] == theirs[None]).all(-1)
+            assert not same.any()

@@ -13,8 +13,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training.helpers import QUIET, short_fit, small_data, tiny_data
 
-from lcplearn.datasets import BlockData
-from lcplearn.formulations import FORMULATIONS, MLP, Affine, Formulation, Physical, Structured
+from lcplearn.datasets import BlockData, windows
+from lcplearn.formulations import FORMULATIONS, MLP, Affine, Formulation, Physical, Structured, loss_terms
 from lcplearn.training import Optimizer, TrainingDivergedError, TrainingInterrupted, figures, fit, load
 from lcplearn.training.metrics import KEYS, UNITS, evaluate, format_table
 from lcplearn.training.writing import replace, write_figures
@@ -331,3 +331,40 @@ def test_of_two_trainings_at_once_in_a_folder_the_second_is_refused(
     with pytest.raises(ValueError, match="holds a run already"):
         short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=1)
     assert (tmp_path / "run" / "last.ckpt").read_bytes() == before
+
+
+def test_what_is_minimised_is_the_weighted_sum_and_what_is_best_is_judged_by_the_rollout(tmp_path: Path) -> None:
+    data, seen = tiny_data(noise=0.01), []
+    weights = {"prediction": 2.0, "rollout": 3.0}
+
+    class Look(Callback):
+        def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, *rest: Any) -> None:
+            terms = {name: float(value) for name, value in outputs.items()}
+            seen.append(terms["total"] / (2.0 * terms["prediction"] + 3.0 * terms["rollout"]))
+
+        def on_validation_end(self, trainer: Any, pl_module: Any) -> None:
+            with torch.no_grad():
+                terms = loss_terms(pl_module.model, windows(data.validation, 3), weights)
+            found = trainer.callback_metrics
+            seen.append(float(found["val/loss"] / (2.0 * terms["prediction"] + 3.0 * terms["rollout"])))
+            seen.append(float(found["val/rollout_rmse"] / terms["rollout"].sqrt()))
+
+    trainer = QUIET | {"check_val_every_n_epoch": 1, "callbacks": [Look()]}
+    short_fit(Structured(dt=data.dt), data, tmp_path / "run", loss=weights, horizon=3, epochs=2, trainer=trainer)
+    assert seen == pytest.approx(6 * [1.0])
+
+
+def test_the_time_of_training_before_a_resumption_counts(tmp_path: Path) -> None:
+    data, last = tiny_data(), tmp_path / "first" / "last.ckpt"
+    short_fit(Structured(dt=data.dt), data, tmp_path / "first", epochs=2)
+    torch.save(torch.load(last) | {"train_seconds": 1000.0}, last)
+    result = short_fit(Structured(dt=data.dt), data, tmp_path / "second", ckpt_path=last)
+    assert result.metrics is not None
+    assert 1000.0 < (result.metrics["train_seconds"] or 0.0) < 1100.0
+    assert 1000.0 < torch.load(tmp_path / "second" / "last.ckpt")["train_seconds"] < 1100.0
+
+
+def test_adam_decays_by_a_cosine_to_zero_where_lbfgs_takes_over_or_training_ends() -> None:
+    for optimizer, epochs in ((Optimizer(lr=0.2), 100), (Optimizer(lr=0.2, lbfgs_after=100), 300)):
+        rates = [optimizer.learning_rate(epoch, epochs) for epoch in (0, 25, 50, 100)]
+        assert rates == pytest.approx([0.2, 0.1 * (1 + 0.5**0.5), 0.1, 0.0])
