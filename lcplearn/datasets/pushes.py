@@ -1,0 +1,214 @@
+"""Real pushes of a steel triangle by a robot's finger: where it stood, how the finger moved, where it ended."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lcplearn.datasets.files import check_offsets, find, positive_number, read_npz
+from lcplearn.scenes.pushed_object import Push
+
+FILE = "planar_pushes.npz"
+PROTOCOLS = ("known", "unseen_supports", "few")
+_INPUTS = (
+    "config", "pre_pose", "pusher", "pusher_offsets", "config_name", "config_surface", "object_vertices", "object_com",
+    "object_mass",
+)  # fmt: skip
+_OUTCOME = ("post_pose", "force", "force_offsets")
+
+
+class Pushes(NamedTuple):
+    """All that a model sees of pushes.
+
+    The end pose of one push is the start pose of the next in these recordings, so that their order tells the answer:
+    it is not here.
+
+    Attributes:
+        push: Start pose, and the straightened path of the finger.
+        points: The three support points in the object's frame [m]; NaN where the whole face bears.
+        surface: Name of the surface under each.
+    """
+
+    push: Push
+    points: Float[Tensor, "b 3 2"]
+    surface: tuple[str, ...]
+
+    def take(self, index: Sequence[int] | Tensor) -> "Pushes":
+        """Some of them, by index or mask."""
+        rows = torch.as_tensor(index)
+        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        surface = tuple(self.surface[k] for k in rows.tolist())
+        return Pushes(Push(*(part[rows] for part in self.push)), self.points[rows], surface)
+
+    @property
+    def whole_face(self) -> Bool[Tensor, " b"]:
+        """Where the object rests on its face and not on three points."""
+        return self.points.isnan().any(-1).any(-1)
+
+
+class Outcome(NamedTuple):
+    """What was recorded: how pushes ended.
+
+    Attributes:
+        pose: x [m], y [m], angle [rad] of the object's frame at the end.
+        force: Force on the object [N], world, mean over the second half of the recording's time.
+    """
+
+    pose: Float[Tensor, "b 3"]
+    force: Float[Tensor, "b 2"]
+
+    def take(self, index: Sequence[int] | Tensor) -> "Outcome":
+        """Some of them, by index or mask."""
+        rows = torch.as_tensor(index)
+        return Outcome(self.pose[rows], self.force[rows])
+
+
+class Split(NamedTuple):
+    """Indices of the pushes to learn from and of those to judge on."""
+
+    train: Int[Tensor, " n"]
+    test: Int[Tensor, " m"]
+
+
+@dataclass(frozen=True)
+class PushData:
+    """Pushes, their outcome, and how models are judged on them.
+
+    Attributes:
+        pushes: What models see.
+        outcome: What they are to predict.
+        configuration: Number of the configuration of each push, for reports.
+        names: Name of each configuration.
+        vertices: Corners of the object in its frame [m], counterclockwise.
+        com: Its centre of mass [m].
+        mass: [kg].
+        splits: Each trains a model of its own; the figures are those of all their test pushes together.
+    """
+
+    pushes: Pushes
+    outcome: Outcome
+    configuration: Int[Tensor, " b"]
+    names: tuple[str, ...]
+    vertices: Float[Tensor, "v 2"]
+    com: Float[Tensor, "2"]
+    mass: float
+    splits: tuple[Split, ...] = ()
+
+
+def read_pushes(
+    path: Path | str | None = None,
+    *,
+    protocol: str = "known",
+    folds: int = 10,
+    training_pushes: int | None = None,
+    seed: int = 0,
+) -> PushData:
+    """Real pushes, and how to judge models on them.
+
+    Protocols: "known" leaves each of `folds` random parts out in turn; "unseen_supports" leaves each support geometry
+    out, on all surfaces; "few" learns from `training_pushes` random ones and is judged on all others, `folds` times.
+
+    Args:
+        path: The file; None for planar_pushes.npz where `find` looks.
+        protocol: One of `PROTOCOLS`.
+        folds: Parts, or repetitions.
+        training_pushes: Pushes to learn from with "few".
+        seed: Seed of the parts.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not as described in data/README.md, or a setting does not fit it.
+    """
+    path = find(FILE) if path is None else Path(path)
+    data = read_all_pushes(path)
+    count = len(data.configuration)
+    if protocol not in PROTOCOLS:
+        raise ValueError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {protocol}")
+    if not 2 <= folds <= count:
+        raise ValueError(f"folds: expected 2 to {count} (the pushes in {path}), got {folds}")
+    if (training_pushes is not None) != (protocol == "few"):
+        raise ValueError(f"training_pushes: expected with protocol=few and only there, got {training_pushes}")
+    if training_pushes is not None and not 0 < training_pushes < count:
+        raise ValueError(f"training_pushes: expected 1 to {count - 1}, got {training_pushes}")
+    generator = torch.Generator().manual_seed(seed)
+    if protocol == "few":
+        orders = [torch.randperm(count, generator=generator) for _ in range(folds)]
+        splits = [Split(order[:training_pushes], order[training_pushes:]) for order in orders]
+    elif protocol == "known":
+        order = torch.randperm(count, generator=generator)
+        parts = [order[k::folds] for k in range(folds)]
+        splits = [Split(torch.cat([*parts[:k], *parts[k + 1 :]]), parts[k]) for k in range(folds)]
+    else:
+        geometry = geometries(data.pushes.points)
+        splits = [Split((geometry != k).nonzero()[:, 0], (geometry == k).nonzero()[:, 0]) for k in geometry.unique()]
+    return PushData(**{**vars(data), "splits": tuple(splits)})
+
+
+def read_all_pushes(path: Path | str) -> PushData:
+    """All pushes of a file, without splits: to score a model that is trained.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not as described in data/README.md.
+    """
+    arrays = read_npz(path, _INPUTS + _OUTCOME)
+    arrays |= read_npz(path, ("config_support_points",), finite=False)  # NaN where the whole face bears
+    count, configurations = len(arrays["config"]), len(arrays["config_name"])
+    shapes = {
+        "config": (count,), "pre_pose": (count, 3), "post_pose": (count, 3), "config_surface": (configurations,),
+        "config_support_points": (configurations, 3, 2), "object_com": (2,),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{path}: {name}: expected shape {list(shape)}, got {list(arrays[name].shape)}")
+    for name in ("pusher", "force"):
+        if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or len(arrays[f"{name}_offsets"]) != count + 1:
+            raise ValueError(f"{path}: {name}: expected rows of 3 numbers for {count} pushes")
+        check_offsets(path, arrays[f"{name}_offsets"], len(arrays[name]))
+    config = arrays["config"].astype(np.int64)
+    if count == 0 or config.min() < 0 or config.max() >= configurations:
+        raise ValueError(f"{path}: config: expected numbers from 0 to {configurations - 1} for at least one push")
+    ends = np.array([straighten(rows[:, 1:]) for rows in _records(arrays, "pusher")])
+    push = Push(*(torch.from_numpy(part).to(torch.float64) for part in (arrays["pre_pose"], ends[:, 0], ends[:, 1])))
+    force = np.array([rows[rows[:, 0] >= rows[-1, 0] / 2.0, 1:].mean(0) for rows in _records(arrays, "force")])
+    return PushData(
+        pushes=Pushes(
+            push,
+            torch.from_numpy(arrays["config_support_points"][config]).to(torch.float64),
+            tuple(str(arrays["config_surface"][k]) for k in config),
+        ),
+        outcome=Outcome(torch.from_numpy(arrays["post_pose"]).to(torch.float64), torch.from_numpy(force)),
+        configuration=torch.from_numpy(config),
+        names=tuple(str(name).partition("/")[0] for name in arrays["config_name"]),
+        vertices=torch.from_numpy(arrays["object_vertices"]).to(torch.float64),
+        com=torch.from_numpy(arrays["object_com"]).to(torch.float64),
+        mass=positive_number(path, "object_mass", arrays["object_mass"]),
+    )
+
+
+def straighten(path: Float[NDArray, "n 2"]) -> Float[NDArray, "2 2"]:
+    """First and last point of a path, on its line of least squares.
+
+    Recorded to 0.1 mm, a path of 30 ms steps jumps in direction from step to step; the finger itself moved straight.
+    """
+    points = path.astype(np.float64)
+    middle = points.mean(0)
+    direction = np.linalg.svd(points - middle, full_matrices=False)[2][0]
+    return middle + np.outer((points[[0, -1]] - middle) @ direction, direction)
+
+
+def geometries(points: Float[Tensor, "b 3 2"]) -> Int[Tensor, " b"]:
+    """Number of each push's support geometry: the same three points in any order, or the whole face."""
+    keys = [tuple(sorted(map(tuple, p.nan_to_num(-1.0).mul(1e6).round().tolist()))) for p in points]
+    numbers = {key: k for k, key in enumerate(dict.fromkeys(keys))}
+    return torch.tensor([numbers[key] for key in keys])
+
+
+def _records(arrays: dict[str, NDArray], name: str) -> list[NDArray]:
+    return np.split(arrays[name].astype(np.float64), arrays[f"{name}_offsets"][1:-1])
