@@ -126,6 +126,8 @@ def check_resumable(
                 f"{path} was trained with {name} {before}, but the settings say {ours['objective'][name]}."
             )
     changed = _differences(checkpoint["training"], ours["training"])
+    if "data.recordings" not in changed:  # the same numbers, however they were asked for
+        changed = {name: pair for name, pair in changed.items() if not name.startswith("data.")}
     if changed and not allow_changes:
         # That recordings differ follows from another setting, unless it is the only difference.
         name, (before, after) = next(iter(sorted(changed.items(), key=lambda item: item[0] == "data.recordings")))
