@@ -12,6 +12,7 @@ from lightning.pytorch import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training.helpers import QUIET, short_fit, small_data, tiny_data
+from training.kill import kill_once
 
 from lcplearn.datasets import BlockData, windows
 from lcplearn.formulations import FORMULATIONS, MLP, Affine, Formulation, Physical, Structured, loss_terms
@@ -368,3 +369,9 @@ def test_adam_decays_by_a_cosine_to_zero_where_lbfgs_takes_over_or_training_ends
     for optimizer, epochs in ((Optimizer(lr=0.2), 100), (Optimizer(lr=0.2, lbfgs_after=100), 300)):
         rates = [optimizer.learning_rate(epoch, epochs) for epoch in (0, 25, 50, 100)]
         assert rates == pytest.approx([0.2, 0.1 * (1 + 0.5**0.5), 0.1, 0.0])
+
+
+def test_kill_9_leaves_checkpoints_that_load(tmp_path: Path) -> None:
+    """`python tests/training/kill.py` does it 50 times, with large files and on two file systems."""
+    for number, moment in enumerate((0.05, 0.3)):
+        assert kill_once(tmp_path / str(number), tmp_path, 50, moment) == (0, 0)

@@ -1,0 +1,198 @@
+"""What tests/mutate.py breaks. A mutation is found by its text, so that it may move within its file."""
+
+from typing import NamedTuple
+
+
+class Mutation(NamedTuple):
+    """One change that a test must notice.
+
+    Attributes:
+        breaks: What is wrong with it.
+        file: Where.
+        old: Text that stands there once.
+        new: What takes its place.
+        tests: Files of the tests that guard it.
+        keyword: Which of their tests, as pytest's -k has it; all if empty.
+        origin: "first" for those that a review tried, of which 22 of 45 had survived, else "second".
+        equivalent: Why no test can notice it; empty for all others.
+    """
+
+    breaks: str
+    file: str
+    old: str
+    new: str
+    tests: str
+    keyword: str = ""
+    origin: str = "first"
+    equivalent: str = ""
+
+
+LCP, SCENES, DATA = "lcplearn/lcp/", "lcplearn/scenes/", "lcplearn/datasets/"
+MODELS, TRAINING = "lcplearn/formulations/", "lcplearn/training/"
+FIT, METRICS, GRADIENT = "tests/training/test_fit.py", "tests/training/test_metrics.py", "tests/lcp/test_gradient.py"
+COMPARE, PREDICT = "tests/training/test_compare.py", "tests/training/test_predict.py"
+COMMAND = "tests/training/test_command_line.py"
+
+FIRST = [
+    # Those that had survived.
+    Mutation("test and validation draw the training data's numbers", DATA + "simulate.py",
+             "manual_seed(len(_SPLITS) * seed + split)", "manual_seed(len(_SPLITS) * seed)",
+             "tests/datasets/test_simulate.py", "split"),
+    Mutation("what sticks: 1e-6 m/s", MODELS + "formulation.py", "STICK_SPEED = 1e-12", "STICK_SPEED = 1e-6", METRICS),
+    Mutation("loss weights are ignored", TRAINING + "module.py", "[self.loss[name] * term for",
+             "[term for", FIT, "weighted"),
+    Mutation("the best model is that of the smallest loss", TRAINING + "module.py", "values = {VALIDATION: deployed,",
+             "values = {VALIDATION: total,", FIT, "weighted"),
+    Mutation("the 90th percentile is the median", TRAINING + "metrics.py", "error.quantile(0.9)", "error.quantile(0.5)",
+             METRICS),
+    Mutation("rollout_rmse_1000 over 100 steps", TRAINING + "metrics.py", "_rollout_rmse(model, data.test_long, 1000)",
+             "_rollout_rmse(model, data.test_long, 100)", METRICS),
+    Mutation("unsolved_share is always 0", TRAINING + "metrics.py", "1.0 - float(solution.solved.double().mean())",
+             "0.0 * float(solution.solved.double().mean())", METRICS),
+    Mutation("false_stick is over all steps", TRAINING + "metrics.py", "_share(still[~sticks])",
+             "_share(still & ~sticks)", METRICS),
+    Mutation("a step behind a recording's end counts", TRAINING + "metrics.py",
+             "torch.arange(recordings.forces.shape[1], device=steps.device) < steps[:, None]",
+             "torch.arange(recordings.forces.shape[1], device=steps.device) <= steps[:, None]", METRICS),
+    Mutation("seconds before a resumption are forgotten in metrics", TRAINING + "fitting.py",
+             'before["train_seconds"], {"from"', '0.0, {"from"', FIT, "time_of_training"),
+    Mutation("seconds before a resumption are forgotten in checkpoints", TRAINING + "module.py",
+             'self.seconds_before = checkpoint["train_seconds"]', "self.seconds_before = 0.0", FIT, "time_of_training"),
+    Mutation("last.ckpt is written at the end only", TRAINING + "callbacks.py", " or done % self.every == 0:", ":",
+             FIT, "last_ckpt_is_written"),
+    Mutation("no cosine decay", TRAINING + "optimizer.py",
+             "self.lr * 0.5 * (1.0 + math.cos(math.pi * min(epoch / max(last, 1), 1.0)))", "self.lr + 0.0 * last",
+             FIT, "cosine"),
+    Mutation("torch's judge sees no single rows", LCP + "residuals.py", "torch.maximum(natural / q_size, rows)",
+             "natural / q_size", "tests/lcp/test_residuals.py"),
+    Mutation("torch's judge accepts 1e-3", LCP + "residuals.py", "rounding.clamp(max=1e-6)", "rounding.clamp(max=1e-3)",
+             "tests/lcp/test_residuals.py"),
+    Mutation("a kink is what is small to 1e-3", LCP + "solution.py", "(self.z <= 1e-8 * z_scale)",
+             "(self.z <= 1e-3 * z_scale)", "tests/lcp/test_solution.py " + GRADIENT, "kink"),
+    Mutation("forward mode of an unsolved element is not zero", LCP + "gradient.py",
+             "torch.where(solved, dw, 0.0).to(dtype)", "dw.to(dtype)", GRADIENT, "not_solved or forward"),
+    Mutation("the rank of float64 blocks is that of 1e-3", LCP + "gradient.py", "torch.float64: (EPS, 1e-11)",
+             "torch.float64: (EPS, 1e-3)", GRADIENT),
+    Mutation("the rank of float32 blocks is that of float64", LCP + "gradient.py", "torch.float32: (1e-7, 1e-5)",
+             "torch.float32: (EPS, 1e-11)", GRADIENT),
+    Mutation("torch's gradient of an unsolved element is not zero", LCP + "gradient.py",
+             "(torch.where(solved, x, 0.0) for x in (grad_z, grad_w, z))", "(x for x in (grad_z, grad_w, z))",
+             GRADIENT, "not_solved"),
+    Mutation("the kernel's judge accepts 1e-3", LCP + "pivoting.py", "max(tol, min(1e-6,", "max(tol, min(1e-3,",
+             "tests/lcp/test_residuals.py"),
+    Mutation("a certificate may be wrong by 1e-3", LCP + "pivoting.py", "proven and total <= 1e-12 * size",
+             "proven and total <= 1e-3 * size", "tests/lcp/test_solution.py tests/lcp/test_solve.py"),
+    # Those that had been caught.
+    Mutation("the adjoint has the wrong sign", LCP + "gradient.py", "rhs = -g_z - multiply(M.mT, h_I)",
+             "rhs = g_z - multiply(M.mT, h_I)", GRADIENT, "finite_differences"),
+    Mutation("the adjoint's block is not transposed", LCP + "gradient.py", "K = M.mT\n", "K = M\n", GRADIENT,
+             "finite_differences or kernel_equals"),
+    Mutation("the nonbasic part is not transposed", LCP + "gradient.py", "multiply(M.mT, h_I)", "multiply(M, h_I)",
+             GRADIENT, "finite_differences or kernel_equals"),
+    Mutation("smoothing adds nothing to the diagonal", LCP + "gradient.py", "K + torch.diag_embed(damping), rhs",
+             "K + 0.0 * torch.diag_embed(damping), rhs", GRADIENT, "smoothed"),
+    Mutation("forward mode forgets dM", LCP + "gradient.py",
+             "e = e + torch.where(solved, multiply(dM.double(), z), 0.0)", "e = e + 0.0", GRADIENT, "forward"),
+    Mutation("windows end one step late", DATA + "recordings.py", "recordings.steps[:, None] - k).clamp",
+             "recordings.steps[:, None] - k + 1).clamp", "tests/datasets/test_windows.py"),
+    Mutation("windows have the force of the next step", DATA + "recordings.py", "instants[:, :-1]\n",
+             "instants[:, 1:]\n", "tests/datasets/test_windows.py"),
+    Mutation("slides are one step too long", DATA + "cube_slides.py", "[len(slide) - 1 for slide in slides]",
+             "[len(slide) for slide in slides]", "tests/datasets/test_cube_slides.py " + PREDICT, "slides"),
+    Mutation("validation slides are tested on", DATA + "cube_slides.py", "_recordings(slides[training_slides:])",
+             "_recordings(slides[learning:])", "tests/datasets/test_cube_slides.py"),
+    Mutation("the sliding block's test is noisy", DATA + "simulate.py",
+             'measured = velocities + (noise if name in ("train", "validation") else 0.0) * draw.noise',
+             "measured = velocities + noise * draw.noise", "tests/datasets/test_simulate.py"),
+    Mutation("explicit Euler", MODELS + "formulation.py",
+             "torch.stack((position + self.dt * velocity, velocity), dim=-1)",
+             "torch.stack((position + self.dt * state.double()[..., 1], velocity), dim=-1)",
+             "tests/formulations/test_formulations.py"),
+    Mutation("mu is read out without the mass", MODELS + "structured.py",
+             "(self.log_a + self.log_c).exp().item()", "self.log_c.exp().item()",
+             "tests/formulations/test_formulations.py tests/formulations/test_learning.py"),
+    Mutation("mass is read out as its inverse", MODELS + "structured.py", "self.b_weight[1].reciprocal().item()",
+             "self.b_weight[1].item()", "tests/formulations/test_formulations.py tests/formulations/test_learning.py"),
+    Mutation("padding counts in the loss", MODELS + "losses.py", "/ valid.sum().clamp(min=1)", "/ valid.numel()",
+             "tests/formulations/test_losses.py"),
+    Mutation("the violation's friction is not limited", MODELS + "losses.py",
+             "torch.where(inside.abs() <= limit, inside, beyond)", "inside + 0.0 * beyond",
+             "tests/formulations/test_losses.py"),
+    Mutation("the last parameters are taken, not the best", TRAINING + "fitting.py",
+             'module.load_state_dict(checkpoint["state_dict"])', "pass", FIT, "best_model_before"),
+    Mutation("early stopping ends before LBFGS has begun", TRAINING + "callbacks.py",
+             "if optimizer.lbfgs_after is None or optimizer.finishes(trainer.current_epoch):", "if True:",
+             FIT, "early or plateau or precision"),
+    Mutation("another loss is resumed in silence", TRAINING + "checkpoint.py",
+             'if before != ours["objective"][name]:', "if False:", FIT, "foreign"),
+    Mutation("batches are not shuffled", TRAINING + "fitting.py", "shuffle=batch_size is not None", "shuffle=False",
+             FIT, "equal_seeds"),
+    Mutation("a row shows its best seed", "lcplearn/compare.py", "statistics.median if finite else middle",
+             "min if finite else middle", COMPARE),
+    Mutation("motion's time starts at the first step", "lcplearn/predict.py",
+             "np.arange(positions.shape[-1]) * dt", "(1 + np.arange(positions.shape[-1])) * dt",
+             PREDICT, "csv_prediction"),
+    Mutation("the summary's worst residual is the best", LCP + "solution.py", "float(solved.max())",
+             "float(solved.min())", "tests/lcp/test_solution.py"),
+    Mutation("Lemke's tableau is never asked", LCP + "pivoting.py", "proven = qu <= -1e-9 * size",
+             "proven = qu < -1e300 * size",
+             "tests/lcp/test_solution.py"),
+]
+
+SECOND = [
+    Mutation(*each, origin="second")  # type: ignore[arg-type]
+    for each in [
+        ("Coulomb's limit is twice as large", SCENES + "sliding_block.py",
+         "limit = self.mu * self.mass * self.gravity\n",
+         "limit = 2 * self.mu * self.mass * self.gravity\n", "tests/scenes/test_sliding_block.py"),
+        ("a block that rests slips", SCENES + "sliding_block.py", "torch.where(next_velocity == 0, int(Mode.STICK)",
+         "torch.where(next_velocity != 0, int(Mode.STICK)", "tests/scenes/test_sliding_block.py"),
+        ("ReLU does not start mirrored", MODELS + "relu.py", "output.weight[1] = -output.weight[0]", "pass",
+         "tests/formulations/test_formulations.py tests/formulations/test_learning.py"),
+        ("a ramp of friction labels: slack is the limit less", DATA + "simulate.py", 'return slack if kind == "slack"',
+         'return slack if kind == "lcp"', "tests/datasets/test_simulate.py"),
+        ("a share of ranks sees the same windows", DATA + "loader.py",
+         "torch.arange(rank, self._shard_size() * world_size, world_size)",
+         "torch.arange(0, self._shard_size() * world_size, world_size)", "tests/datasets/test_windows.py"),
+        ("each epoch has the same order", DATA + "loader.py", "1_000_003 * self.epoch", "0 * self.epoch",
+         "tests/datasets/test_windows.py"),
+        ("checkpoints are written in place", TRAINING + "writing.py", 'beside = path.with_name(f".{path.name}.part")',
+         "beside = path", FIT, "written_whole"),
+        ("last.ckpt is written before the best score is known", TRAINING + "callbacks.py",
+         ", save_on_train_epoch_end=False", "", FIT, "last_ckpt_is_written"),
+        ("a diverged training goes on", TRAINING + "callbacks.py", "        if not diverged:\n", "        if True:\n",
+         FIT,
+         "diverges"),
+        ("another seed is resumed in silence", TRAINING + "checkpoint.py", "if changed and not allow_changes:",
+         "if False:", FIT, "refused_by_name"),
+        ("the data's fingerprint is that of anything", TRAINING + "fitting.py",
+         "digest.update(tensor.detach().cpu().numpy().tobytes())", "pass", FIT, "refused_by_name"),
+        ("any module is imported", TRAINING + "checkpoint.py", "if not (trust or module in sys.modules or",
+         "if not (True or module in sys.modules or", PREDICT, "trusted"),
+        ("NaN parameters are loaded", TRAINING + "checkpoint.py", "    if wrong:\n", "    if False:\n",
+         PREDICT, "not_finite"),
+        ("a diverged run is left out of its row", "lcplearn/compare.py",
+         "[worst if value is None or math.isinf(value) else value for value in found]",
+         "[value for value in found if value is not None and not math.isinf(value)]", COMPARE),
+        ("runs of other epochs share a row", "lcplearn/compare.py",
+         '"trainer.enable_progress_bar"', '"trainer."', COMPARE),
+        ("one seed twice is two seeds", "lcplearn/compare.py", "len(runs), len(seeds)", "len(runs), len(runs)",
+         COMPARE),
+        ("an input's time step is not looked at", "lcplearn/predict.py",
+         "if inputs.dt is not None and abs(inputs.dt / model.dt - 1.0) > 1e-6:", "if False:",
+         PREDICT, "time_step or sentence"),
+        ("surplus cells are dropped", "lcplearn/predict.py", "if len(cells) != len(header):",
+         "if len(cells) < len(header):", PREDICT, "wrong_input_file"),
+        ("forces [T, 1] are T trajectories", "lcplearn/predict.py", "forces = forces[..., 0]\n", "pass\n", PREDICT,
+         "last_axis"),
+        ("a folder is used twice", TRAINING + "command_line.py", "            chosen.mkdir()\n",
+         "            chosen.mkdir(exist_ok=True)\n", COMMAND, "taken or second"),
+        ("a mistake leaves its folder", TRAINING + "command_line.py", "shutil.rmtree(folder)\n        return",
+         "return", COMMAND, "latest"),
+        ("the mean of a pair of diverged and finite counts", "lcplearn/compare.py",
+         "statistics.median_low if worst < 0 else statistics.median_high",
+         "statistics.median_high if worst < 0 else statistics.median_low", COMPARE),
+    ]
+]  # fmt: skip
+
+MUTATIONS = [*FIRST, *SECOND]
