@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -273,7 +274,7 @@ def _try_once(model: Formulation, window: Windows, loss: Mapping[str, float]) ->
 
 
 def _new_folder(folder: str | Path | None) -> Path:
-    folder = Path(folder) if folder is not None else Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    folder = Path(folder) if folder is not None else Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     # The other processes of strategy=ddp start when the first has already written its settings there.
     if getattr(rank_zero_only, "rank", 0) == 0 and (folder / "config.yaml").exists():
         raise _taken(folder)
