@@ -68,7 +68,7 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
     if not q.is_cpu:
         raise ValueError(f"method 'pivoting' runs on the CPU; got M and q on {q.device}")
     single = q.dtype is torch.float32
-    solution: LCPSolution = kernel.solve_batch(
+    solution, unsolved = kernel.solve_batch(
         plain(M),
         plain(q),
         single_precision=single,
@@ -76,7 +76,34 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
         tol=options.tol,
         initial_basis=initial_basis,
     )
+    if unsolved and options.method == "auto":
+        solution = _rescued(solution, M, q, options)
     return _rounded(solution) if single else solution
+
+
+def _rescued(solution: LCPSolution, M: Tensor, q: Tensor, options: Options) -> LCPSolution:
+    """The solution with its UNSOLVED elements solved by the interior point, where that can."""
+    n = q.shape[-1]
+    lost = torch.nonzero(solution.status.reshape(-1) == Status.UNSOLVED.value).squeeze(-1)
+    M = M.expand(*q.shape, n).reshape(-1, n, n)[lost].double()
+    hopeful = _may_be_monotone(M)
+    M, lost = M[hopeful], lost[hopeful]
+    if len(lost):
+        found = _solve_in_torch(M, q.reshape(-1, n)[lost].double(), options)
+        for whole, part in zip(solution, found, strict=True):
+            whole.reshape(-1, *part.shape[1:])[lost[found.solved]] = part[found.solved]
+    return solution
+
+
+def _may_be_monotone(M: Tensor) -> Tensor:
+    """Whether each pair of rows could be one of a copositive matrix or of a P-matrix.
+
+    The interior point rarely solves another, and takes a thousand times as long as the kernel to find that out.
+    """
+    d = M.diagonal(dim1=-2, dim2=-1)
+    product = d.unsqueeze(-1) * d.unsqueeze(-2)
+    copositive = M + M.mT >= -2.0001 * product.clamp_min(0).sqrt()
+    return ((d >= 0).unsqueeze(-1) & (copositive | (M * M.mT <= product))).all(-1).all(-1)
 
 
 def _rounded(solution: LCPSolution) -> LCPSolution:

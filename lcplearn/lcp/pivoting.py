@@ -74,8 +74,8 @@ def solve_batch(
     max_iter: int | None,
     tol: float | None = None,
     initial_basis: Tensor | None = None,
-) -> LCPSolution:
-    """Solve a batch of LCPs; each element's result is independent of its neighbours, bit by bit.
+) -> tuple[LCPSolution, int]:
+    """Solve a batch of LCPs, and count the UNSOLVED; an element's result does not depend on its neighbours by a bit.
 
     Args:
         M: [*batch, n, n], or [n, n] shared by the batch; contiguous float64 on the CPU, never written to.
@@ -101,12 +101,12 @@ def solve_batch(
         tol = 2e-6 if single_precision else 1e-10
     budget = -1 if max_iter is None else max_iter
     _announce_compilation()
-    _solve_range(
+    unsolved = _solve_range(
         status.numel(), n, M.dim() == 2, address(M), address(q), tol, single_precision, budget,
         initial_basis is not None, np.empty(3 * n * n + 25 * n + 13), address(z), address(w), address(basis),
         address(residual), address(status), address(iterations), address(certificate),
     )  # fmt: skip
-    return LCPSolution(z, w, basis, status, residual, iterations, certificate)
+    return LCPSolution(z, w, basis, status, residual, iterations, certificate), unsolved
 
 
 def solve_adjoint(
@@ -428,8 +428,19 @@ def _evaluate(S, p, z, w, omega):
         omega[i] = size
 
 
+@_jit
+def _largest_share(S, z, omega, j):
+    """The largest part that column j has in what a row is a sum of: z_j counts by it however rows and columns scale."""
+    largest = 0.0
+    for i in range(z.size):
+        term = abs(S[i, j]) * z[j]
+        if term > largest * omega[i]:
+            largest = term / omega[i]
+    return largest
+
+
 @_jit_inline
-def _judge(q, p, d, r, c, s, z, w, omega, tol):
+def _judge(q, S, p, d, r, c, s, z, w, omega, tol):
     """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
     n = q.size
     smallest = TINY / s if s < 1e-150 else 0.0  # not a denormal, with which arithmetic is slow
@@ -444,7 +455,10 @@ def _judge(q, p, d, r, c, s, z, w, omega, tol):
         noise = max(noise, EPS * f * omega[i] if abs(w[i]) <= 8.0 * EPS * omega[i] else 0.0)
         q_size = max(q_size, f * abs(p[i]))
         w_share = w[i] / max(omega[i], smallest * r[i]) if w[i] != 0.0 else 0.0
-        rows = max(rows, abs(min(c[i] * z[i] / z_size if z[i] > 0.0 else 0.0, w_share)))
+        z_share = c[i] * z[i] / z_size if z[i] > 0.0 else 0.0
+        if z[i] > 0.0 and w_share > 64.0 * EPS and w_share > z_share and w_share > rows:
+            z_share = max(z_share, _largest_share(S, z, omega, i))
+        rows = max(rows, abs(min(z_share, w_share)))
         absMz = max(absMz, f * (omega[i] - abs(p[i])))
         lost = lost or (abs(p[i]) < TINY and abs(q[i]) >= unseen)
         total += abs(w[i]) * s / r[i] + c[i] * s * z[i]
@@ -707,7 +721,7 @@ def _lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied,
 
 
 @_jit
-def _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, ratio, tied, u, cap):
+def _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, ratio, tied, u, margin, cap):
     """Minimise z_0 subject to S z + cover z_0 + p >= 0; where the minimum is positive its dual u is Farkas' proof.
 
     At the optimum z_0 = b + u.w + v.z with u, v >= 0 holds identically in z: S'u = -v <= 0 and p.u = -b < 0. In units
@@ -731,9 +745,12 @@ def _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, rat
         _exchange(T, basic, column, place, leaving, c, ratio, buffer)
     largest = 0.0
     for i in range(n):
-        if place[i] < 0:
-            u[i] = max(T[-1 - place[i], place[2 * n]], 0.0) * r[i]
-            largest = max(largest, u[i])
+        u[i] = T[-1 - place[i], place[2 * n]] if place[i] < 0 else 0.0
+        largest = max(largest, u[i])
+    noise, largest = 64.0 * EPS * largest, 0.0  # of the tableau: alone in its column it would refute the proof
+    for i in range(n):
+        u[i] = u[i] * r[i] if u[i] > noise else 0.0
+        largest = max(largest, u[i])
     if not 0.0 < largest <= LARGEST:
         return False
     qu, size = 0.0, 0.0
@@ -741,7 +758,7 @@ def _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, rat
         u[i] /= largest
         qu += q[i] * u[i]
         size += abs(q[i]) * u[i]
-    proven = qu <= -1e-9 * size and 0.0 < size <= LARGEST
+    proven = qu <= -margin * size and 0.0 < size <= LARGEST
     for j in range(n):
         total, size = 0.0, 0.0
         for i in range(n):
@@ -812,6 +829,120 @@ def _interior_point(S, p, A, rows, cols, z, w, omega, r, dz, dw, scratch, cap):
     return cap
 
 
+# --- scale by scale ------------------------------------------------------------------------------------------------
+#
+# Where q holds sizes far apart (a contact at rest, 1e-15, beside one that slides, 1), a path that is followed at the
+# large size decides the small rows by rounding. So: at a basis A exchange z_A and w_A. What is then far above zero in
+# z_A and w_I stays as it is whatever the small rows do; the others are an LCP of their own, in their own size, whose
+# solution flips members of the basis. Then again one size down.
+
+
+@_jit
+def _point_of_basis(S, p, A, k, rows, cols, index, z, w, omega, x, scratch):
+    """z with w_A = 0 from the factors of S_AA, of any sign, size by size: small entries hold digits of their own."""
+    z[:] = 0.0
+    _evaluate(S, p, z, w, omega)
+    for _ in range(8):
+        rough, largest = False, 0.0
+        for a in range(k):
+            i = index[a]
+            x[a] = -w[i] if abs(w[i]) > 8.0 * EPS * omega[i] else 0.0
+            rough = rough or x[a] != 0.0
+        if not rough:
+            break
+        _solve(A, k, k, rows, cols, x, scratch)
+        for a in range(k):
+            largest = max(largest, abs(x[a]))
+        for a in range(k):
+            z[index[a]] += x[a] if abs(x[a]) > 64.0 * EPS * largest else 0.0
+        _evaluate(S, p, z, w, omega)
+
+
+@_jit
+def _exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch):
+    """P: how z_A and w_I of the members answer to their w_A and z_I (the principal pivot transform, in part)."""
+    for b in range(m):
+        j = members[b]
+        for a in range(k):
+            x[a] = (1.0 if index[a] == j else 0.0) if basis[j] else -S[index[a], j]
+        _solve(A, k, k, rows, cols, x, scratch)
+        for a in range(k):
+            scratch[index[a]] = x[a]
+        for a in range(m):
+            i = members[a]
+            total, size = scratch[i], 1.0
+            if not basis[i]:
+                total = 0.0 if basis[j] else S[i, j]
+                size = abs(total)
+                for e in range(k):
+                    term = S[i, index[e]] * x[e]
+                    total += term
+                    size += abs(term)
+            P[a, b] = total if abs(total) > 1e-13 * size else 0.0
+
+
+@_jit
+def _solve_small(P, small, flips, cap):
+    """Lemke's method on P and small, scaled to 1, else block pivoting; which members are basic, and the pivots."""
+    m = small.size
+    S, size, T = np.empty((m, m)), np.empty((m, m)), np.empty((m + 2, (m + 3) // 4 * 4))
+    d, p, z, w, omega, y = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    cover, ratio, buffer = np.ones(m), np.empty(m + 2), np.empty(m + 3)
+    basic, column, place = np.empty(m, np.int64), np.empty(m + 1, np.int64), np.empty(2 * m + 1, np.int64)
+    tied, rows, cols, other = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.int64)
+    _equilibrate(P, size, ratio, d)
+    c = d.copy()
+    _scale(P, small, d, c, S, p)
+    ended, count = _lemke(S, p, cover, 1e-9, T, basic, column, place, buffer, ratio, tied, flips, z, cap)
+    if ended == STUCK:
+        for i in range(m):
+            other[i] = p[i] < 0.0
+        ended, rounds = _block_pivoting(S, p, other, size, rows, cols, tied, basic, z, w, omega, ratio, y, 20)
+        count += rounds
+        if ended == DONE:
+            flips[:] = other
+    return count
+
+
+@_jit
+def _solve_by_scale(q, S, p, d, r, c, s, A, rows, cols, index, members, basis, z, w, omega, x, scratch, tol, cap):
+    """Solve from the given basis down, one size of the unknowns after the other; the pivots taken."""
+    n = p.size
+    P, small, flips = np.empty((n, n)), np.empty(n), np.empty(n, np.int64)
+    size, pivots = np.inf, 0
+    for _ in range(8):
+        k = _gather(S, basis, A, index)
+        if _factor(A, k, rows, cols, 4.0 * n * EPS, False) < k:
+            break
+        _point_of_basis(S, p, A, k, rows, cols, index, z, w, omega, x, scratch)
+        largest = 0.0
+        for i in range(n):
+            small[i] = z[i] if basis[i] else (w[i] if abs(w[i]) > 8.0 * EPS * omega[i] else 0.0)
+            largest = max(largest, small[i])
+            z[i] = max(z[i], 0.0)
+        _evaluate(S, p, z, w, omega)
+        residual, limit = _judge(q, S, p, d, r, c, s, z, w, omega, tol)
+        m, wrong = 0, 0
+        for i in range(n):
+            if small[i] <= 1e-7 * min(size, largest):
+                members[m], small[m] = i, small[i]
+                wrong += small[i] < 0.0
+                m += 1
+        if residual <= limit or wrong == 0 or pivots >= cap:
+            break
+        _exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch)
+        part = np.ascontiguousarray(P[:m, :m])
+        pivots += _solve_small(part, small[:m], flips[:m], cap - pivots)
+        size, changed = 0.0, 0
+        for a in range(m):
+            basis[members[a]] ^= flips[a]
+            changed += flips[a]
+            size = max(size, abs(small[a]))
+        if changed == 0:
+            break
+    return pivots
+
+
 # --- the cascade ----------------------------------------------------------------------------------------------------
 
 
@@ -860,7 +991,7 @@ def _solve_one(
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
     s = _scale(M, q, r, c, S, p)
     stage = -1 if warm or n < 6 or n > 40 else 0
-    while stage < 8 and not (accepted and (not (stage == 1 or stage == 7) or best <= 1e-3 * tol)):
+    while stage < 10 and not (accepted and (not (stage == 1 or stage == 7) or best <= 1e-3 * tol)):
         stage = 7 if capped and stage < 7 and (budget >= 0 or stage >= 4) else stage + 1
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
@@ -889,23 +1020,32 @@ def _solve_one(
                 basis[i] = z[i] > w[i]
                 z[i] = z[i] if basis[i] else 0.0
             _evaluate(S, p, z, w, omega)
-        else:
+        elif stage == 8:
             count = 0
             _polish(S, p, basis, T, place, False, A, rows, cols, index, z, w, omega, x, y)
+        else:
+            for i in range(n):
+                basis[i] = basis_out[i] and stage == 9
+            count = _solve_by_scale(
+                q, S, p, d, r, c, s, A, rows, cols, index, basic, basis, z, w, omega, x, y, tol, left
+            )
         used += count
         if (stage == 0 or stage == 2 or stage == 3) and ended != DONE:
             continue
-        residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
+        residual, limit = _judge(q, S, p, d, r, c, s, z, w, omega, tol)
         if residual > limit and _drop_noise(z, w, omega, S, tol):
             _evaluate(S, p, z, w, omega)
-            residual, limit = _judge(q, p, d, r, c, s, z, w, omega, tol)
+            residual, limit = _judge(q, S, p, d, r, c, s, z, w, omega, tol)
         good = residual <= limit
         if (good and not accepted) or (residual < best and (good or not accepted)):
             holds = _write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
             best, accepted = residual if holds else np.inf, good and holds
         if ended == STUCK and not asked and not accepted:
             asked = True
-            if _prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, 20 * n + 50):
+            margin = 1e-3 if single_precision else 1e-9  # rounding of the data to float32 proves nothing
+            if _prove_infeasible(
+                M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, margin, 20 * n + 50
+            ):
                 for i in range(n):
                     u_out[i] = v[i]
                 return INFEASIBLE, best, used
@@ -936,6 +1076,7 @@ def _solve_range(
     basic, basis = _integers(scratch, f + 3 * n, n), _integers(scratch, f + 4 * n, n)
     column, place = _integers(scratch, f + 5 * n, n + 1), _integers(scratch, f + 6 * n + 1, 2 * n + 1)
     # and that is all of it: at most 3 n^2 + 25 n + 13 numbers, as width <= n + 3
+    unsolved = 0
     for b in range(B):
         Mb, qb = Ms[0 if shared else b], qs[b]
         for i in range(n):  # until a stage has a candidate
@@ -956,6 +1097,8 @@ def _solve_range(
             Mb, qb, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
             rows, cols, index, basic, basis, column, place, zs[b], ws[b], bases[b], us[b]
         )  # fmt: skip
+        unsolved += statuses[b] == UNSOLVED
+    return unsolved
 
 
 @_jit

@@ -113,7 +113,8 @@ def judge(
     z_size = z.abs().amax(-1, keepdim=True).clamp_min(TINY)
     omega = q.abs() + absMz
     off_path = (w - smoothing / z.clamp_min(TINY)).abs() if smoothing else w
-    rows = torch.minimum(z / z_size, off_path / omega.clamp_min(TINY)).abs().amax(-1)
+    share = torch.maximum(z / z_size, (M.abs() * z.unsqueeze(-2) / omega.clamp_min(TINY).unsqueeze(-1)).amax(-2))
+    rows = torch.minimum(share, off_path / omega.clamp_min(TINY)).abs().amax(-1)
     residual = torch.maximum(natural / q_size, rows)
     noise = torch.where(w.abs() <= 8 * EPS * omega, EPS * d * omega, 0.0).amax(-1) / q_size
     residual = torch.where(noise > 1e-6, torch.maximum(residual, noise), residual)

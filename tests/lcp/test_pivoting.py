@@ -24,7 +24,7 @@ def solve(M, q, *, single_precision=False, max_iter=None, initial_basis=None, **
     M, q = M.reshape(-1, *M.shape[-2:]), q.reshape(-1, q.shape[-1])
     M, q = (torch.from_numpy(np.ascontiguousarray(x)) for x in (M[0] if len(M) < len(q) else M, q))
     basis = None if initial_basis is None else torch.as_tensor(initial_basis)
-    result = pivoting.solve_batch(
+    result, _ = pivoting.solve_batch(
         M, q, single_precision=single_precision, max_iter=max_iter, initial_basis=basis, **options
     )
     return LCPSolution(*(x.numpy() for x in result))
@@ -278,7 +278,8 @@ def test_nonfinite_element_is_reported_and_leaves_its_neighbours_alone():
 
 def test_empty_problems_and_batches_are_solved():
     for B, n in ((0, 3), (4, 0), (0, 0)):
-        result = pivoting.solve_batch(torch.zeros(B, n, n), torch.zeros(B, n), single_precision=False, max_iter=None)
+        M, q = torch.zeros(B, n, n), torch.zeros(B, n)
+        result, _ = pivoting.solve_batch(M, q, single_precision=False, max_iter=None)
         assert result.z.shape == (B, n)
         assert result.status.shape == (B,)
         assert (result.status == Status.SOLVED).all()

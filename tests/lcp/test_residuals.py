@@ -20,7 +20,7 @@ def judged_by_kernel(M: np.ndarray, q: np.ndarray, z: np.ndarray, tol: float = 1
     s = pivoting._scale(M, q, r, c, S, p)
     scaled = z / s / c
     pivoting._evaluate(S, p, scaled, w, omega)
-    return pivoting._judge(q, p, d, r, c, s, scaled, w, omega, tol)
+    return pivoting._judge(q, S, p, d, r, c, s, scaled, w, omega, tol)
 
 
 def judged_by_torch(M: np.ndarray, q: np.ndarray, z: np.ndarray, tol: float = 1e-10) -> tuple[float, float]:

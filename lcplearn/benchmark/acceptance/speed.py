@@ -84,7 +84,7 @@ def check_sequence(family: str, options: Options) -> Finding:
         return skipped("quantecon is not installed")
     data = _data(family, _batch(options), options.seed)
     M, q, _ = data
-    before = _kernel(*map(torch.from_numpy, (M, q)))
+    before, _ = _kernel(*map(torch.from_numpy, (M, q)))
     q = q + DRIFT * line(family, data, options.seed).dq
     tensors = torch.from_numpy(M), torch.from_numpy(q)
     start = partial(_kernel, *tensors, initial_basis=before.basis)
