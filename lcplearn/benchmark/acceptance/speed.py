@@ -95,7 +95,7 @@ def check_sequence(family: str, options: Options) -> Finding:
     }
     times = _in_turns(calls, options)
     ratio, low, high = times["quantecon"].over(times["from basis"])
-    kept = float((start().basis == before.basis).all(1).double().mean())
+    kept = float((start()[0].basis == before.basis).all(1).double().mean())
     gain, _, _ = times["cold"].over(times["from basis"])
     words = f"{low:.2f} to {high:.2f}; {gain:.2f} times faster than without a basis; {kept:.0%} keep theirs"
     return Finding(ratio, True, ratio >= 2.0, words)
