@@ -99,7 +99,7 @@ def sentence(error: BaseException) -> str:
 
 def command(arguments: list[str]) -> None:
     """Check what can be checked at once, then let Hydra run it."""
-    from lcplearn.training.command_line import prepare, settle, version_line
+    from lcplearn.command_line import prepare, settle, version_line
     from lcplearn.training.settings import check_torchrun
 
     if arguments == ["--version"]:

@@ -7,56 +7,100 @@ it are run. Exit status 1 if one survives, or if its text is no longer found.
 """
 
 import argparse
+import importlib
+import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 
 from mutations import MUTATIONS, Mutation
 
 ROOT = Path(__file__).parents[1]
+LOG = "mutate.log"
+# What every test file waits for; not lcplearn itself, which is imported from the mutated copy.
+HEAVY = ("pytest", "torch", "lightning.pytorch", "hydra", "numba", "matplotlib.figure")
 
 
 def copy_tree(target: Path) -> None:
-    """Copy what git knows or would add, so without environments, runs and caches."""
+    """Copy what git knows or would add, and the compiled kernel, which is the slowest thing to make."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
-    for name in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    names += [str(path.relative_to(ROOT)) for path in (ROOT / "lcplearn").rglob("*.nb[ic]")]
+    for name in names:
         if (ROOT / name).is_file():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target / name)
 
 
-def judge(mutation: Mutation, tree: Path, limit: float) -> str:
-    """Apply one mutation, run its tests and take it back: caught, survived, stale or error."""
+def run_tests(tree: Path, mutation: Mutation, log: Path) -> None:
+    """Be a process that runs pytest in the copy, and ends with its status."""
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.chdir(tree)
+    os.environ["PYTHONPATH"] = str(tree)  # of what the tests start
+    sys.path[:] = [str(tree), *(path for path in sys.path if Path(path or ".").resolve() not in (ROOT, ROOT / "tests"))]
+    arguments = [
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-W",
+        "ignore::pytest.PytestAssertRewriteWarning",
+        *mutation.tests.split(),
+    ]
+    arguments += ["-k", mutation.keyword] if mutation.keyword else []
+    try:
+        status = int(importlib.import_module("pytest").main(arguments))
+    except BaseException:  # noqa: BLE001  # whatever it is, no test has failed
+        traceback.print_exc()
+        status = 99
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def status(tree: Path, mutation: Mutation, limit: float) -> int | None:
+    """Exit status of a mutation's tests in the copy as it is: 1 if one failed, None if they took too long."""
+    sys.stdout.flush()
+    process = multiprocessing.get_context("fork").Process(target=run_tests, args=(tree, mutation, tree / LOG))
+    process.start()
+    process.join(limit)
+    if process.is_alive():
+        process.kill()
+        return None
+    return process.exitcode
+
+
+def judge(mutation: Mutation, tree: Path, limit: float, unbroken: dict[tuple[str, str], int | None]) -> str:
+    """Apply one mutation, run its tests and take it back: caught, survived, stale or error.
+
+    `unbroken` remembers how the tests end without it.
+    """
     path = tree / mutation.file
     text = path.read_text() if path.is_file() else ""
     if text.count(mutation.old) != 1:
         return "stale"
-    environment = os.environ | {
-        "PYTHONPATH": str(tree),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "OMP_NUM_THREADS": "1",
-        "NUMBA_CACHE_DIR": str(
-            tree / "cache"
-        ),  # numba looks at the date of a file, which may be that of the one before
-    }
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *mutation.tests.split()]
-    if mutation.keyword:
-        command += ["-k", mutation.keyword]
-    try:
+    key = (mutation.tests, mutation.keyword)
+    if key not in unbroken:
+        unbroken[key] = status(tree, mutation, limit)
+    if (ends := unbroken[key]) == 0:
+        times = path.stat()
         path.write_text(text.replace(mutation.old, mutation.new))
-        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=limit)
-    except subprocess.TimeoutExpired:
-        return "caught"  # it runs for ever: whoever waits for the tests notices
-    finally:
-        path.write_text(text)
-    if done.returncode not in (0, 1):  # 1: a test failed; others: none was run
-        print(done.stdout[-2000:], done.stderr[-2000:], file=sys.stderr)
-        return "error"
-    return "caught" if done.returncode else "survived"
+        try:
+            ends = status(tree, mutation, limit)
+        finally:
+            path.write_text(text)
+            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # numba knows what it compiled by the date
+        if ends in (0, 1):
+            return "caught" if ends else "survived"
+    print(f"{mutation.breaks}: pytest ended with {ends}\n{(tree / LOG).read_text()[-2000:]}", file=sys.stderr)
+    return "error"
 
 
 def main() -> None:
@@ -67,9 +111,15 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=300.0, help="seconds for the tests of one")
     options = parser.parse_args()
     chosen = [each for each in MUTATIONS if options.only in f"{each.file} {each.breaks} {each.origin}"]
+    chosen.sort(key=lambda each: "pivoting" in each.file or "kernel" in each.file)  # they compile it anew
+    if not options.list:
+        os.environ |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+        sys.dont_write_bytecode = True
+        for name in HEAVY:
+            importlib.import_module(name)
     counts = dict.fromkeys(("caught", "equivalent", "survived", "stale", "error"), 0)
     with tempfile.TemporaryDirectory() as folder:
-        tree = Path(folder)
+        tree, unbroken = Path(folder), {}
         copy_tree(tree)
         for number, mutation in enumerate(chosen, start=1):
             start = time.perf_counter()
@@ -77,7 +127,7 @@ def main() -> None:
             if mutation.equivalent or options.list:
                 result = ("equivalent" if mutation.equivalent else "caught") if found else "stale"
             else:
-                result = judge(mutation, tree, options.limit)
+                result = judge(mutation, tree, options.limit, unbroken)
             counts[result] += 1
             word = ("there" if result != "stale" else result) if options.list else result
             print(f"{number:3d}/{len(chosen)} {word:<10} {time.perf_counter() - start:5.1f} s  "

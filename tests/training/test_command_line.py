@@ -8,7 +8,7 @@ import pytest
 from hydra.errors import HydraException
 from training.helpers import ROOT
 
-from lcplearn.training.command_line import _new, prepare, settle
+from lcplearn.command_line import _new, prepare, settle
 from lcplearn.training.settings import SettingsError
 
 CONF = ROOT / "conf"
@@ -88,5 +88,5 @@ def test_a_folder_without_a_run_goes_and_latest_is_the_last_with_one() -> None:
 
 
 def test_nothing_here_imports_torch() -> None:
-    code = "import sys, lcplearn.training.command_line; sys.exit('torch' in sys.modules)"
+    code = "import sys, lcplearn.command_line; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
