@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from lcplearn.formulations.networks import positive
 from lcplearn.lcp.solution import LCPSolution
-from lcplearn.lcp.solve import Method, solve_lcp
+from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.rollout import Mode, Trajectory, rollout
 
 STICK_SPEED = 1e-12  # [m/s] below it a block rests: exact zeros pass, values that a fit only drives towards zero do not
@@ -103,7 +103,7 @@ class Formulation(nn.Module):
         return {}
 
     def solve(
-        self, M: Float[Tensor, "*#batch n n"], q: Float[Tensor, "*#batch n"], method: Method = "auto"
+        self, M: Float[Tensor, "*#batch n n"], q: Float[Tensor, "*#batch n"], method: str = "auto"
     ) -> LCPSolution:
         """Solve the model's LCP and keep the detached solution as `last_solution` for reports."""
         solution = solve_lcp(M, q, method=method)

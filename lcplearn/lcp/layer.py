@@ -3,7 +3,6 @@
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lcplearn.lcp.methods import Method
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import check_options, solve_lcp
 
@@ -18,7 +17,7 @@ class LCPLayer(nn.Module):
     def __init__(
         self,
         *,
-        method: Method = "auto",
+        method: str = "auto",
         tol: float | None = None,
         max_iter: int | None = None,
         smoothing: float = 0.0,

@@ -2,18 +2,46 @@
 
 import math
 import warnings
+from collections.abc import Callable
 from functools import cache
 from types import ModuleType
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, interior_point
+from lcplearn.lcp.interior_point import DEFAULT_MAX_ITER, Iterate, follow_path, interior_point
 from lcplearn.lcp.residuals import judge
 from lcplearn.lcp.solution import LCPSolution, Status
 
-Method = Literal["auto", "diagonal", "pivoting", "interior_point"]
+
+class TorchMethod(NamedTuple):
+    """A method that runs on any device.
+
+    Attributes:
+        solve: Takes float64 M [b, n, n], q [b, n], all finite, n > 0, and the keywords max_iter and smoothing.
+        general: Whether it solves every solvable problem with a positive semidefinite or P-matrix.
+        smooths: Whether it knows the smoothed problem.
+    """
+
+    solve: Callable[..., Iterate]
+    general: bool = True
+    smooths: bool = False
+
+
+def diagonal(M: Tensor, q: Tensor, *, max_iter: int, smoothing: float) -> Iterate:
+    """Closed form for diagonal M; the judge, which sees all of M, catches one that is not."""
+    M = M.diagonal(dim1=-2, dim2=-1)
+    basis = (q < 0) & (M > 0)
+    zero = torch.zeros(len(q), dtype=torch.int64, device=q.device)
+    return Iterate(torch.where(basis, -q / M, 0.0), q.clamp_min(0), basis, zero, zero > 0)
+
+
+TORCH_METHODS = {
+    "interior_point": TorchMethod(interior_point, smooths=True),
+    "diagonal": TorchMethod(diagonal, general=False),
+}
+METHODS = ("auto", "pivoting", *TORCH_METHODS)
 
 
 class Options(NamedTuple):
@@ -29,7 +57,11 @@ def solve(M: Tensor, q: Tensor, initial_basis: Tensor | None, options: Options) 
     """Solve q [*batch, n] with M [*batch, n, n], or [n, n] shared by the batch. Gradient mode must be off."""
     if pivots(q, options):
         return _solve_by_pivoting(M, q, initial_basis, options)
-    return _solve_in_torch(M, q, options)
+    if options.method != "auto":
+        return _solve_in_torch(TORCH_METHODS[options.method], M, q, options)
+    if q.is_cpu or options.smoothing:
+        return _solve_in_torch(TORCH_METHODS["interior_point"], M, q, options)
+    return solve_without_waiting(M, q, options)
 
 
 def pivots(q: Tensor, options: Options) -> bool:
@@ -64,9 +96,9 @@ def _solve_by_pivoting(M: Tensor, q: Tensor, initial_basis: Tensor | None, optio
     """Run the CPU kernel, which judges for itself with the same residual."""
     kernel = pivoting_kernel()
     if kernel is None:
-        raise ValueError("method 'pivoting' needs numba; use 'interior_point' or 'auto'")
+        raise ValueError("method: expected 'auto' or 'interior_point', for numba is missing; got 'pivoting'")
     if not q.is_cpu:
-        raise ValueError(f"method 'pivoting' runs on the CPU; got M and q on {q.device}")
+        raise ValueError(f"M, q: expected the CPU, where method 'pivoting' runs; got {q.device}")
     single = q.dtype is torch.float32
     solution, unsolved = kernel.solve_batch(
         plain(M),
@@ -119,43 +151,52 @@ def _rounded(solution: LCPSolution) -> LCPSolution:
     )
 
 
-def _solve_in_torch(M: Tensor, q: Tensor, options: Options) -> LCPSolution:
-    """Flatten the batch, set aside what needs no solver, run the method, judge."""
+def solve_without_waiting(M: Tensor, q: Tensor, options: Options) -> LCPSolution:
+    """Follow the path on an accelerator, ask it once who is not SOLVED, and solve those few on the CPU."""
+    solution = _solve_in_torch(TorchMethod(follow_path), M, q, options)
+    n = q.shape[-1]
+    status = solution.status.flatten()
+    left = torch.nonzero((status != Status.SOLVED) & (status != Status.NONFINITE_INPUT)).squeeze(-1)
+    if not len(left):
+        return solution
+    M = M if M.dim() == 2 else M.reshape(-1, n, n)[left]
+    rest = solve(M.detach().cpu(), q.detach().reshape(-1, n)[left].cpu(), None, options)
+    return LCPSolution(
+        *(
+            whole.reshape(-1, *part.shape[1:]).index_copy(0, left, part.to(whole.device)).reshape(whole.shape)
+            for whole, part in zip(solution, rest, strict=True)
+        )
+    )
+
+
+def _solve_in_torch(method: TorchMethod, M: Tensor, q: Tensor, options: Options) -> LCPSolution:
+    """Flatten the batch, run the method, judge; what needs no solver is masked, so that nothing waits for values."""
     if q.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"M and q must be on the CPU or a CUDA device, which have float64; got {q.device}")
-    method, tol, max_iter, smoothing = options
+        raise ValueError(f"M, q: expected the CPU or a CUDA device, which have float64; got {q.device}")
+    _, tol, max_iter, smoothing = options
     shape, n = q.shape, q.shape[-1]
     count = math.prod(shape[:-1])
     M = M.detach().expand(*shape, n).reshape(count, n, n).double()
     q64 = q.detach().reshape(count, n).double()
     finite = M.isfinite().all(-1).all(-1) & q64.isfinite().all(-1)
-    end = Iterate(
-        z=torch.zeros_like(q64),
-        w=q64.clone(),
-        basis=torch.zeros_like(q64, dtype=torch.bool),
-        iterations=torch.zeros(count, dtype=torch.int64, device=q.device),
-        exhausted=torch.zeros(count, dtype=torch.bool, device=q.device),
+    easy = ~finite if smoothing else ~finite | (q64 >= 0).all(-1)  # z = 0 whatever M is
+    row = easy.unsqueeze(-1)
+    solver = method.solve if n else diagonal
+    z, w, basis, iterations, exhausted = solver(
+        torch.where(row.unsqueeze(-1), torch.eye(n, dtype=M.dtype, device=M.device), M),
+        torch.where(row, 1.0, q64),
+        max_iter=max_iter or DEFAULT_MAX_ITER,
+        smoothing=smoothing,
     )
-    # q >= 0 is solved by z = 0 whatever M is.
-    todo = finite & ((q64 < 0).any(-1) | (smoothing > 0 and n > 0))
-    if todo.any():
-        if method == "diagonal":
-            found = _diagonal(M[todo], q64[todo])
-        else:
-            found = interior_point(M[todo], q64[todo], max_iter=max_iter or DEFAULT_MAX_ITER, smoothing=smoothing)
-        for whole, part in zip(end, found, strict=True):
-            whole[todo] = part
+    end = Iterate(
+        z=torch.where(row, 0.0, z),
+        w=torch.where(row, q64, w),
+        basis=basis & ~row,
+        iterations=torch.where(easy, 0, iterations),
+        exhausted=exhausted & ~easy,
+    )
     residual, tolerance = judge(M, q64, end.z, tol=tol, smoothing=smoothing)
     return _pack(q, end, finite, residual, residual <= tolerance)
-
-
-def _diagonal(M: Tensor, q: Tensor) -> Iterate:
-    """Closed form for diagonal M; the judge, which sees all of M, catches one that is not."""
-    diagonal = M.diagonal(dim1=-2, dim2=-1)
-    basis = (q < 0) & (diagonal > 0)
-    z = torch.where(basis, -q / diagonal, 0.0)
-    zero = torch.zeros_like(q[:, 0])
-    return Iterate(z, q.clamp_min(0), basis, zero.long(), zero > 0)
 
 
 def _pack(q: Tensor, end: Iterate, finite: Tensor, residual: Tensor, solved: Tensor) -> LCPSolution:

@@ -1,7 +1,6 @@
 """`solve_lcp`: check the arguments, solve, differentiably."""
 
 import math
-from typing import get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from lcplearn.lcp.compiled import traced_solve
 from lcplearn.lcp.gradient import differentiable_solve
-from lcplearn.lcp.methods import Method, Options
+from lcplearn.lcp.methods import METHODS, TORCH_METHODS, Options
 from lcplearn.lcp.residuals import default_tolerance
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.torch_internals import traced
@@ -21,7 +20,7 @@ def solve_lcp(
     M: Float[Tensor, "*#batch n n"],
     q: Float[Tensor, "*#batch n"],
     *,
-    method: Method = "auto",
+    method: str = "auto",
     tol: float | None = None,
     max_iter: int | None = None,
     smoothing: float = 0.0,
@@ -75,7 +74,7 @@ def solve_lcp(
         M, q = _broadcast(M, q)
     if initial_basis is not None:
         if method not in ("auto", "pivoting"):
-            raise ValueError(f"initial_basis needs method 'pivoting' or 'auto'; got method {method!r}")
+            raise ValueError(f"method: expected auto or pivoting for initial_basis; got {method!r}")
         initial_basis = _expand_basis(initial_basis, q)
     options = Options(method, float(tol or default_tolerance(q.dtype)), max_iter, float(smoothing))
     run = traced_solve if traced() else differentiable_solve
@@ -87,16 +86,17 @@ def solve_lcp(
 
 def check_options(method: str, tol: float | None, max_iter: int | None, smoothing: float) -> None:
     """Raise ValueError for options that no problem could use."""
-    if method not in get_args(Method):
-        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
+    if method not in METHODS:
+        raise ValueError(f"method: expected one of {', '.join(METHODS)}; got {method!r}")
     if tol is not None and not (_is_number(tol) and 0 < tol < math.inf):
-        raise ValueError(f"tol must be positive and finite, or None; got {tol!r}")
+        raise ValueError(f"tol: expected a positive finite number, or None; got {tol!r}")
     if max_iter is not None and not (type(max_iter) is int and 0 < max_iter < 2**63):
-        raise ValueError(f"max_iter must be a positive integer, or None; got {max_iter!r}")
+        raise ValueError(f"max_iter: expected a positive integer, or None; got {max_iter!r}")
     if not (_is_number(smoothing) and 0 <= smoothing < math.inf):
-        raise ValueError(f"smoothing must be finite and at least 0; got {smoothing!r}")
-    if smoothing > 0 and method not in ("auto", "interior_point"):
-        raise ValueError(f"smoothing needs method 'interior_point' or 'auto'; got method {method!r}")
+        raise ValueError(f"smoothing: expected a finite number of at least 0; got {smoothing!r}")
+    smoothing_methods = ["auto", *(name for name, entry in TORCH_METHODS.items() if entry.smooths)]
+    if smoothing > 0 and method not in smoothing_methods:
+        raise ValueError(f"method: expected one of {', '.join(smoothing_methods)} for smoothing; got {method!r}")
 
 
 def _is_number(x: object) -> bool:
@@ -108,18 +108,18 @@ def _check_tensors(M: Tensor, q: Tensor) -> None:
     """Raise ValueError for tensors that are no LCPs, whatever their batch dimensions."""
     for name, x in (("M", M), ("q", q)):
         if not isinstance(x, Tensor):
-            raise ValueError(f"{name} must be a torch.Tensor; got {type(x).__name__}")
+            raise ValueError(f"{name}: expected a torch.Tensor; got {type(x).__name__}")
         if x.layout is not torch.strided:
-            raise ValueError(f"{name} must be dense; got {x.layout}")
+            raise ValueError(f"{name}: expected a dense tensor; got {x.layout}")
         if x.dtype not in DTYPES:
-            raise ValueError(f"{name} must be float32 or float64; got {x.dtype}")
+            raise ValueError(f"{name}: expected float32 or float64; got {x.dtype}")
     if M.dtype is not q.dtype or M.device != q.device:
-        raise ValueError(f"M and q must share dtype and device; got {M.dtype} on {M.device}, {q.dtype} on {q.device}")
+        raise ValueError(f"M, q: expected one dtype and device; got {M.dtype} on {M.device}, {q.dtype} on {q.device}")
     M_shape, q_shape = M.shape, q.shape
     if len(M_shape) < 2 or M_shape[-1] != M_shape[-2]:
-        raise ValueError(f"M must have shape [*batch, n, n]; got {list(M_shape)}")
+        raise ValueError(f"M: expected shape [*batch, n, n]; got {list(M_shape)}")
     if len(q_shape) < 1 or q_shape[-1] != M_shape[-1]:
-        raise ValueError(f"q must have shape [*batch, {M_shape[-1]}] to match M {list(M_shape)}; got {list(q_shape)}")
+        raise ValueError(f"q: expected shape [*batch, {M_shape[-1]}] to match M {list(M_shape)}; got {list(q_shape)}")
 
 
 def _broadcast(M: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -129,7 +129,7 @@ def _broadcast(M: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
         batch = torch.broadcast_shapes(M.shape[:-2], q.shape[:-1])
     except RuntimeError:
         raise ValueError(
-            f"batch dimensions of M {list(M.shape)} and q {list(q.shape)} must broadcast; they do not"
+            f"M, q: expected batch dimensions that broadcast; got {list(M.shape)} and {list(q.shape)}"
         ) from None
     shared = M.shape[:-2].numel() == 1
     return M.reshape(n, n) if shared else M.expand(*batch, n, n), q.expand(*batch, n)
@@ -143,7 +143,7 @@ def _expand_basis(basis: Tensor, q: Tensor) -> Tensor:
         found = f"{basis.dtype} {list(basis.shape)} on {basis.device}"
     else:
         return basis.expand(q.shape)
-    raise ValueError(f"initial_basis must be a bool tensor of shape {list(q.shape)} on {q.device}; got {found}")
+    raise ValueError(f"initial_basis: expected a bool tensor of shape {list(q.shape)} on {q.device}; got {found}")
 
 
 def _expands(shape: torch.Size, target: torch.Size) -> bool:

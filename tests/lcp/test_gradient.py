@@ -9,8 +9,9 @@ from torch.autograd import gradcheck, gradgradcheck
 from lcplearn import solve_lcp
 from lcplearn.benchmark.problems.families import stacked_cubes
 from lcplearn.lcp.gradient import adjoint
+from lcplearn.lcp.methods import TORCH_METHODS
 
-METHODS = ("pivoting", "interior_point")
+METHODS = ("pivoting", *(name for name, method in TORCH_METHODS.items() if method.general))
 FRICTION = [[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]]  # notes 2.5 with mass = dt = 1
 
 

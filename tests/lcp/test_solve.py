@@ -10,8 +10,9 @@ from lcp.oracles import FAMILIES, has_solution, natural_residual, planted, rando
 
 from lcplearn import Status, solve_lcp
 from lcplearn.benchmark.problems import families as problems
+from lcplearn.lcp.methods import TORCH_METHODS
 
-METHODS = ("pivoting", "interior_point")
+METHODS = ("pivoting", *(name for name, method in TORCH_METHODS.items() if method.general))
 entries = st.integers(-3, 3)
 
 

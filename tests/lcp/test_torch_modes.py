@@ -12,9 +12,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import lcplearn.lcp
 from lcplearn import solve_lcp
-from lcplearn.lcp.methods import pivoting_kernel
+from lcplearn.lcp.methods import TORCH_METHODS, pivoting_kernel
 
-METHODS = ("pivoting", "interior_point")
+METHODS = ("pivoting", *(name for name, method in TORCH_METHODS.items() if method.general))
 
 
 def problem(batch: int = 3, n: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
@@ -176,19 +176,19 @@ def test_without_numba_auto_warns_once_and_solves_by_interior_point(monkeypatch)
             solve_lcp(M, q).z.sum().backward()
         assert ["interior point, many times slower" in str(warning.message) for warning in record] == [True]
         assert torch.equal(solution.z, solve_lcp(M, q, method="interior_point").z)
-        with pytest.raises(ValueError, match="needs numba"):
+        with pytest.raises(ValueError, match="numba is missing; got 'pivoting'"):
             solve_lcp(M, q, method="pivoting")
     finally:
         pivoting_kernel.cache_clear()
 
 
 def test_pivoting_refuses_other_devices():
-    with pytest.raises(ValueError, match="'pivoting' runs on the CPU; got M and q on meta"):
+    with pytest.raises(ValueError, match="M, q: expected the CPU, where method 'pivoting' runs; got meta"):
         solve_lcp(torch.eye(2, device="meta"), torch.ones(2, device="meta"), method="pivoting")
 
 
 @pytest.mark.parametrize("method", ["auto", "diagonal", "interior_point"])
 def test_devices_without_float64_are_refused(method):
     """The meta device stands in for Apple's."""
-    with pytest.raises(ValueError, match="must be on the CPU or a CUDA device, which have float64; got meta"):
+    with pytest.raises(ValueError, match="expected the CPU or a CUDA device, which have float64; got meta"):
         solve_lcp(torch.eye(2, device="meta"), torch.ones(2, device="meta"), method=method)

@@ -1,4 +1,4 @@
-"""What other processes run in test_torch_processes.py; importable by name in a spawned process."""
+"""What other processes run in test_torch_processes.py and test_devices.py; importable by name in a spawned process."""
 
 import torch
 import torch.distributed as dist
@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from lcplearn import LCPLayer, solve_lcp
+from lcplearn.lcp import interior_point
 
 
 class SolvedProblems(Dataset):
@@ -43,3 +44,12 @@ def train_step_in_parallel(rank: int, folder: str) -> None:
     model(inputs()[rank::2]).square().mean().backward()
     torch.save([p.grad for p in model.parameters()], f"{folder}/{rank}.pt")
     dist.destroy_process_group()
+
+
+def compile_path(_: int) -> None:
+    interior_point.ROUNDS_AT_ONCE = 1
+    M, q = 2 * torch.eye(3, dtype=torch.float64) + 0.5 * torch.ones(4, 3, 3, dtype=torch.float64), torch.ones(4, 3)
+    q = q.double() * torch.tensor([-1.0, 1.0, -2.0])
+    compiled = torch.compile(interior_point.follow_path, backend="aot_eager", fullgraph=True)
+    for found, expected in zip(compiled(M, q, max_iter=4), interior_point.follow_path(M, q, max_iter=4), strict=True):
+        assert torch.equal(found, expected)
