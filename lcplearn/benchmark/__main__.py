@@ -19,6 +19,7 @@ STUDIES = {
     "scenes": "what a scene-minimal LCP saves, and error against step size and time",
     "models": "learned formulations: error against time, samples and noise",
     "overhead": "one problem a call, and memory",
+    "devices": "problems a second on a CUDA device, beside the CPU kernel on all cores",
 }
 
 

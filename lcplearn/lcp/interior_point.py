@@ -24,6 +24,7 @@ ROUND = 4  # iterations between two tries of the basis
 ROUNDS_AT_ONCE = 5  # before an accelerator is asked who is left
 EXACT = 16 * EPS
 CONVERGED = 50 * EPS
+NOISE = 64 * EPS  # of the terms that a w is the sum of: smaller ones are zero
 ON_PATH = 1e-11  # relative error of z_i w_i = tau
 PATIENCE = 15  # iterations within which the complementarity gap has to halve
 REFINEMENTS = 3
@@ -213,8 +214,7 @@ def _better(problem: _Problem, best: _Best, z: Tensor, basis: Tensor) -> _Best:
     basis = basis & (z > 0)
     z = torch.where(basis, z, 0.0)
     w = multiply(S, z) + p
-    noise = 8 * EPS * (p.abs() + multiply(S.abs(), z))
-    w = torch.where(basis | (w <= noise), 0.0, w)
+    w = torch.where(basis | (w <= NOISE * (p.abs() + multiply(S.abs(), z))), 0.0, w)
     error = judge(S, p, z, tol=EXACT).residual
     better = error < best.error
     row = better.unsqueeze(-1)

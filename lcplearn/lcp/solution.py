@@ -63,6 +63,15 @@ class LCPSolution(NamedTuple):
     iterations: Int[Tensor, "*batch"]
     certificate: Float[Tensor, "*batch n"]
 
+    def __repr__(self) -> str:
+        try:
+            values = self.status.flatten().tolist()
+        except RuntimeError:  # under vmap and other transforms there are no values
+            values = []
+        counts = [f"{values.count(status)} {status.name} ({status.value})" for status in Status if status in values]
+        fields = [f"{name}={value!r}" for name, value in zip(self._fields, self, strict=True)]
+        return "\n  ".join([f"LCPSolution: {', '.join(counts) or 'no values'}", *fields])
+
     @property
     def solved(self) -> Bool[Tensor, "*batch"]:
         return self.status == Status.SOLVED

@@ -37,8 +37,9 @@ def solve_lcp(
             float64 throughout; results come back in the caller's dtype.
         method: "diagonal" is the closed form z = max(0, -q / diag M) for M that the caller knows to be diagonal (one
             that is not is solved by pivoting on the CPU, and never wrongly SOLVED elsewhere);
-            "pivoting" is the CPU kernel (first call ever: 10-20 s of compilation); "interior_point" runs on any
-            device; "auto" is pivoting on the CPU and interior_point elsewhere and for smoothing.
+            "pivoting" is the CPU kernel (the first call ever compiles it: half a minute); "interior_point" runs on
+            any device; "auto" is pivoting on the CPU, and on a CUDA device the path of the interior point, whose few
+            leftovers are solved on the CPU. For smoothing it is interior_point.
         tol: Largest residual (see `residuals.py`) that counts as solved; by default 1e-10 for float64 and 2e-6 for
             float32 data. Rounding raises it where M z cancels against q.
         max_iter: Limit on iterations; by default the method's own.
@@ -64,6 +65,18 @@ def solve_lcp(
 
     Raises:
         ValueError: An argument is wrong; the message names it.
+
+    Example:
+        >>> M = torch.tensor([[2.0, 1.0], [1.0, 2.0]], dtype=torch.float64)
+        >>> q = torch.tensor([[-1.0, 1.0], [1.0, 1.0]], dtype=torch.float64, requires_grad=True)
+        >>> solution = solve_lcp(M, q)
+        >>> solution.z.tolist()
+        [[0.5, 0.0], [0.0, 0.0]]
+        >>> if not solution.solved.all():  # an element that is not SOLVED has a zero gradient
+        ...     solution.raise_if_unsolved()
+        >>> solution.z.sum().backward()
+        >>> q.grad.tolist()
+        [[-0.5, 0.0], [0.0, 0.0]]
 
     Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992); lcp notes, sections 1 to 2.
     """

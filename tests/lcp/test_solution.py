@@ -1,5 +1,7 @@
 """What a solution says about itself: the certificate, the messages, the summary."""
 
+import doctest
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 from lcp.oracles import has_solution
 
 from lcplearn import LCPError, LCPLayer, Status, solve_lcp
+from lcplearn.lcp import solve
 
 
 def proves_infeasibility(M: torch.Tensor, q: torch.Tensor, u: torch.Tensor) -> bool:
@@ -76,3 +79,19 @@ def test_summary_counts_statuses_and_kinks():
     assert summary["nonfinite_input_share"] == 0.25
     assert summary["degenerate_share"] == 0.25
     assert summary["worst_residual"] <= 1e-15
+
+
+def test_repr_names_the_statuses_and_works_without_values():
+    M, q = torch.stack([torch.eye(2), -torch.eye(2), torch.eye(2)]), -torch.ones(3, 2)
+    text = repr(solve_lcp(M, q))
+    assert text.startswith("LCPSolution: 2 SOLVED (0), 1 INFEASIBLE (1)\n  z=tensor(")
+    assert "status=tensor([0, 1, 0])" in text
+    seen = []
+    torch.func.vmap(lambda q: seen.append(repr(solve_lcp(M[0], q))) or q)(q)
+    assert seen[0].startswith("LCPSolution: no values")
+
+
+def test_the_example_of_the_docstring_is_right():
+    results = doctest.testmod(solve, extraglobs={"torch": torch})
+    assert results.attempted >= 6
+    assert results.failed == 0

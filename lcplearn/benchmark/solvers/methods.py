@@ -7,20 +7,19 @@ import numpy as np
 import torch
 
 from lcplearn.benchmark.solvers.peers import peers
+from lcplearn.lcp import methods as lcp_methods
 from lcplearn.lcp.residuals import TINY, default_tolerance, equilibrate, judge, multiply
 from lcplearn.lcp.solution import Status
 from lcplearn.lcp.solve import solve_lcp
 
-# Keywords of `solve_lcp`. A new method is one entry: checks, tests and benchmarks go through this table.
+# Keywords of `solve_lcp`; a new method of the layer is here by itself.
 # The interior point ends on a basis, to rounding; stopped at a coarser tolerance it is the smoothed solution of
 # that complementarity.
 METHODS: dict[str, dict[str, Any]] = {
-    "pivoting": {"method": "pivoting"},
-    "interior_point": {"method": "interior_point"},
+    **{name: {"method": name} for name in lcp_methods.METHODS if name != "auto"},
     "smoothed 1e-10": {"smoothing": 1e-10},
     "smoothed 1e-7": {"smoothing": 1e-7},
     "smoothed 1e-4": {"smoothing": 1e-4},
-    "diagonal": {"method": "diagonal"},
 }
 EXACT = tuple(name for name, keywords in METHODS.items() if "smoothing" not in keywords and name != "diagonal")
 SINGLE = " float32"  # after the name of a method: the same on data and solutions of that precision

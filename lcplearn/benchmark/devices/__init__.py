@@ -1,0 +1,1 @@
+"""`benchmark overhead`: what a call costs beside the solve."""
