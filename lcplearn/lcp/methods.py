@@ -121,7 +121,7 @@ def _rescued(solution: LCPSolution, M: Tensor, q: Tensor, options: Options) -> L
     hopeful = _may_be_monotone(M)
     M, lost = M[hopeful], lost[hopeful]
     if len(lost):
-        found = _solve_in_torch(M, q.reshape(-1, n)[lost].double(), options)
+        found = _solve_in_torch(TORCH_METHODS["interior_point"], M, q.reshape(-1, n)[lost].double(), options)
         for whole, part in zip(solution, found, strict=True):
             whole.reshape(-1, *part.shape[1:])[lost[found.solved]] = part[found.solved]
     return solution
