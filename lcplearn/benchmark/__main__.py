@@ -17,6 +17,7 @@ STUDIES = {
     "acceptance": "each figure the layer must show, measured",
     "stability": "hard cases, sweeps of condition and scale, the noise study: where each method breaks",
     "scenes": "what a scene-minimal LCP saves, and error against step size and time",
+    "engines": "the Stick Bench: scenes with an exact answer, beside physics engines",
     "models": "learned formulations: error against time, samples and noise",
     "overhead": "one problem a call, and memory",
     "devices": "problems a second on a CUDA device, beside the CPU kernel on all cores",

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Value = str | float | int | bool
 Row = dict[str, Value]
-PACKAGES = ("lcplearn", "torch", "numba", "numpy", "quantecon")
+PACKAGES = ("lcplearn", "torch", "numba", "numpy", "quantecon", "mujoco", "drake")
 
 
 @dataclass(frozen=True)

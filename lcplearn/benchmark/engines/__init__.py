@@ -1,0 +1,1 @@
+"""`benchmark engines`, the Stick Bench: twelve scenes with an exact answer, ours beside every installed engine."""

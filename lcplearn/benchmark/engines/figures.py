@@ -1,0 +1,88 @@
+"""Figures of `benchmark engines`."""
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lcplearn.benchmark.engines.cases import StickScene
+from lcplearn.benchmark.harness.figures import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    YELLOW,
+    Style,
+    new_figure,
+    one_legend,
+)
+from lcplearn.benchmark.harness.study import Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LOOKS = {
+    "lcplearn": Style(BLUE, "o"),
+    "lcplearn body": Style(SKY, "s", "--"),
+    "MuJoCo": Style(RED, "v", ":"),
+    "MuJoCo elliptic": Style(ORANGE, "^", "-."),
+    "MuJoCo tuned": Style(PINK, "D"),
+    "Drake": Style(YELLOW, "P", ":"),
+    "Drake tuned": Style(GREEN, "X"),
+    "Drake TAMSI": Style(BLACK, "p", "--"),
+}
+FLOOR = 1e-17  # drawn in place of exactly 0 [m] or [um/s]
+
+
+def error_time(scene: StickScene, rows: Sequence[Row]) -> "Figure":
+    """Position error against CPU time of a simulated second, alone and in a batch; a point a step size."""
+    figure, axes = new_figure(1, 2, width=9.0, height=4.2)
+    panels = (("step_us", "one scene alone"), ("many_us", "one scene of a batch of 256"))
+    for ax, (column, title) in zip(axes[0], panels, strict=True):
+        for name in dict.fromkeys(str(row["engine"]) for row in rows):
+            own = [row for row in rows if row["engine"] == name]
+            x = [1e-6 * float(row[column]) / float(row["dt"]) for row in own]
+            y = [max(float(row["position_error"]), FLOOR) for row in own]
+            _line(ax, name, x, y)
+        ax.set(xscale="log", yscale="log", xlabel="CPU time of a simulated second [s]")
+        ax.set_title(title, fontsize=10)
+        _mark_zero(ax)
+    axes[0, 0].set_ylabel("largest position error [m]")
+    figure.suptitle(scene.name, fontsize=11)
+    one_legend(figure, axes, columns=4)
+    return figure
+
+
+def margin_lines(rows: Sequence[Row], held: float) -> "Figure":
+    """Creep of a pushed block against what friction could hold over the push."""
+    figure, axes = new_figure(width=7.0, height=4.6)
+    ax = axes[0, 0]
+    for name in dict.fromkeys(str(row["engine"]) for row in rows):
+        own = [row for row in rows if row["engine"] == name]
+        margins = [float(re.sub(r".*margin ", "", str(row["scene"]))) for row in own]
+        _line(ax, name, margins, [max(float(row["creep_um_s"]), FLOOR) for row in own])
+    ax.set(xscale="log", yscale="log", xlabel="margin: friction limit over push [-]", ylabel="creep [µm/s]")
+    ax.set_title("a block that friction holds, dt = 2 ms", fontsize=10)
+    _mark_zero(ax)
+    one_legend(figure, axes, columns=4)
+    return figure
+
+
+def _line(ax: "Axes", name: str, x: Sequence[float], y: Sequence[float]) -> None:
+    look = LOOKS[name]
+    order = np.argsort(x)
+    ax.plot(np.array(x)[order], np.array(y)[order], color=look.color, marker=look.marker, linestyle=look.linestyle,
+            markersize=5, label=name)  # fmt: skip
+
+
+def _mark_zero(ax: "Axes") -> None:
+    """A line where exactly 0 is drawn."""
+    ax.axhline(FLOOR, color="0.6", linewidth=0.8)
+    ax.annotate("exactly 0", (0.99, FLOOR), (0, 3), xycoords=("axes fraction", "data"), textcoords="offset points",
+                ha="right", fontsize=8, color="0.4")  # fmt: skip
+    ax.set_ylim(bottom=FLOOR / 5)
