@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -118,9 +118,8 @@ def run(options: Options) -> None:
     study.finish()
 
 
-def _plan(quick: bool) -> Iterator[tuple[str, int, str]]:
-    for family in FAMILIES:
-        for batch in batches(family, quick):
-            yield family, batch, "cpu"
-            if torch.cuda.is_available():
-                yield family, batch, "cuda"
+def _plan(quick: bool) -> list[tuple[str, int, str]]:
+    """Small batches first: a run that is stopped has something to show."""
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    cases = [(family, batch, device) for family in FAMILIES for batch in batches(family, quick) for device in devices]
+    return sorted(cases, key=lambda case: case[1])
