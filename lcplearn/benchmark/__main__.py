@@ -48,10 +48,8 @@ def _run(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(options.threads)
-    if options.command == "fuzz":
-        from lcplearn.benchmark.fuzz.run import run as run_fuzz
-
-        run_fuzz(options)
+    if options.command in ("fuzz", "audit"):
+        import_module(f"lcplearn.benchmark.{options.command}.run").run(options)
         return
     from lcplearn.benchmark.harness.study import Options
 
@@ -75,6 +73,11 @@ def _parser() -> argparse.ArgumentParser:
     fuzz.add_argument("--output", type=Path, default=Path("runs/benchmark/fuzz"), metavar="DIR", help="for findings")
     fuzz.add_argument("--replay", type=Path, metavar="FILE", help="check one finding again, instead of hunting")
     _add_threads_and_seed(fuzz)
+    audit = commands.add_parser("audit", help="count wrong, missed and unproven answers over a million problems")
+    audit.add_argument("--count", type=_at_least(1), default=1_000_000, metavar="N", help="problems (default: 1000000)")
+    audit.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of the data")
+    audit.add_argument("--output", type=Path, metavar="DIR", help="folder (default: runs/benchmark/audit)")
+    _add_threads_and_seed(audit)
     report = commands.add_parser("report", help="gather studies into one self-contained HTML page")
     report.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="folders that commands wrote")
     report.add_argument("--output", type=Path, default=Path("report.html"), metavar="FILE", help="default: report.html")

@@ -316,3 +316,20 @@ def test_kernel_and_torch_agree_on_which_blocks_are_singular(gap, singular):
             ]
         for grad_q in found:
             assert (grad_q.abs().max() < 3) == bounded
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_unsolved_element_has_no_slope_in_any_mode(method):
+    """Forward mode, and reverse mode made of torch's operations (create_graph)."""
+    M = torch.stack((torch.eye(2), torch.tensor([[0.0, 1.0], [0.0, 1.0]])))
+    q = torch.tensor([[-1.0, 1.0], [-1.0, 0.0]])  # the second has no solution
+    assert solve_lcp(M, q, method=method).solved.tolist() == [True, False]
+    _, tangents = torch.func.jvp(
+        lambda M, q: solve_lcp(M, q, method=method)[:2], (M, q), (torch.ones_like(M), torch.ones_like(q))
+    )
+    assert all(tangent[0].any() and not tangent[1].any() for tangent in tangents)
+    M, q = M.requires_grad_(), q.requires_grad_()
+    solution = solve_lcp(M, q, method=method)
+    for gradient in torch.autograd.grad((solution.z + solution.w).sum(), (M, q), create_graph=True):
+        assert gradient[0].any()
+        assert not gradient[1].any()

@@ -242,6 +242,35 @@ def test_infeasible_semidefinite_problems_are_always_proven():
     check_contract(M, q, result)
 
 
+@pytest.mark.parametrize("n", [2, 3, 5, 8])
+def test_a_zero_row_that_asks_for_more_is_proven_infeasible(n):
+    """Rounding in the dual of the other rows must not refute the proof."""
+    rng = np.random.default_rng(n)
+    M = np.eye(n) * rng.integers(1, 4, (200, n, 1))
+    M[:, -1] = 0.0
+    q = -rng.integers(1, 4, (200, n)).astype(float)
+    result = solve(M, q)
+    assert (result.status == Status.INFEASIBLE).all()
+    check_contract(M, q, result)
+
+
+def test_what_rounding_to_float32_makes_infeasible_is_not_called_so():
+    """Redundant contacts have a solution; their data, rounded to float32, may have none by 1e-7."""
+    rng = np.random.default_rng(0)
+    G = rng.standard_normal((2000, 12, 4))
+    M, q, _ = problems._plant(rng, G @ G.transpose(0, 2, 1))
+    M, q = (x.astype(np.float32).astype(float) for x in (M, q))
+    assert (solve(M, q, single_precision=True).status != Status.INFEASIBLE).all()
+    M, q = np.diag([3.0, 0.0]), np.array([-3.0, -1.0])
+    assert solve(M, q, single_precision=True).status[0] == Status.INFEASIBLE
+
+
+def test_a_dual_that_violates_its_constraints_by_a_millionth_proves_nothing():
+    """M = [[1e-6, -1], [1, 1e-6]] is a P-matrix: solvable, though u = (1, 0) nearly has M'u <= 0."""
+    result = solve([[1e-6, -1.0], [0.0, 1e-6]], [-1.0, 0.0])
+    assert result.status[0] != Status.INFEASIBLE
+
+
 def test_feasible_problem_without_solution_is_unsolved():
     assert solve([[0, 1], [0, 1]], [-1, 0]).status[0] == Status.UNSOLVED
 

@@ -110,3 +110,28 @@ def test_one_row_in_large_units_does_not_loosen_the_tolerance_of_the_others():
     M, q, z = np.diag([1e30, 1.0]), np.array([-1e-15, -1.0]), np.array([1e-22, 1.0])
     for residual, tolerance in (judged_by_kernel(M, q, z), judged_by_torch(M, q, z)):
         assert residual > tolerance == pytest.approx(1e-10)
+
+
+@pytest.mark.parametrize("t", [1e16, 1e18])
+def test_a_sum_that_comes_out_as_zero_by_rounding_verifies_nothing(t):
+    """q + M z = 0 exactly in doubles, whichever way it is added: only the size of its terms refuses it."""
+    M, q, z = np.array([[2.0, -2.0], [1.0, -1.0]]), np.array([-2e-3, -2e-3]), np.array([t, t])
+    for residual, tolerance in (judged_by_kernel(M, q, z), judged_by_torch(M, q, z)):
+        assert residual > tolerance
+
+
+def test_rounding_raises_the_tolerance_to_a_millionth_at_most():
+    M, q = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, -1.0])
+    for size, expected in ((1e5, 2e-10), (1e12, 1e-6)):
+        z = np.array([size, size + 1.0])
+        for _, tolerance in (judged_by_kernel(M, q, z), judged_by_torch(M, q, z)):
+            assert tolerance == pytest.approx(max(1e-10, min(1e-6, 20 * 2.2e-16 * size)), rel=0.2)
+            assert tolerance <= max(1e-6, expected)
+
+
+def test_a_small_entry_of_z_counts_by_what_its_column_weighs():
+    """z_2 = 1e-12 beside z_1 = 1 in the caller's units; the second column is 1e12 times as large: not negligible."""
+    M, q = np.array([[1.0, 0.0], [0.0, 1e12]]), np.array([-1.0, 1.0])
+    wrong = np.array([1.0, 1e-12])
+    for residual, tolerance in (judged_by_kernel(M, q, wrong), judged_by_torch(M, q, wrong)):
+        assert residual > 0.1 > tolerance

@@ -95,3 +95,10 @@ def test_the_example_of_the_docstring_is_right():
     results = doctest.testmod(solve, extraglobs={"torch": torch})
     assert results.attempted >= 6
     assert results.failed == 0
+
+
+@pytest.mark.parametrize(("size", "kink"), [(1e-9, True), (1e-7, False), (1e-5, False)])
+def test_a_member_is_degenerate_only_below_a_hundred_millionth_of_the_others(size, kink):
+    M, q = torch.eye(3), torch.tensor([-1.0, 1.0, size])
+    assert solve_lcp(M, q).degenerate.tolist() == [False, False, kink]
+    assert solve_lcp(M, -q).degenerate.tolist() == [False, False, kink]

@@ -9,6 +9,8 @@ from hypothesis.extra.numpy import arrays
 from lcp.oracles import FAMILIES, has_solution, natural_residual, planted, random_family
 
 from lcplearn import Status, solve_lcp
+from lcplearn.benchmark.audit.judges import differs_from_planted, off_in_rows
+from lcplearn.benchmark.fuzz.cases import contact
 from lcplearn.benchmark.problems import families as problems
 from lcplearn.lcp.methods import TORCH_METHODS
 
@@ -76,9 +78,44 @@ def test_row_and_column_scales_of_twelve_decades_do_not_matter(method, family, n
     generator = torch.Generator().manual_seed(n)
     rows, columns = (10 ** (12 * torch.rand(16, n, generator=generator) - 6) for _ in range(2))
     M = rows.unsqueeze(-1) * random_family(family, 16, n, generator) * columns.unsqueeze(-2)
-    q, _ = planted(M, generator)
+    q, z = planted(M, generator)
     solution = solve_lcp(M, q, method=method)
-    assert solution.residual.max() <= 1e-10
+    assert solution.solved.all()
+    assert not differs_from_planted(*(x.numpy() for x in (M, q, solution.z, z)), 1e-10).any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("decades", [6, 8, 10, 12])
+def test_rows_and_columns_in_units_of_their_own_give_the_planted_solution(method, dtype, decades):
+    """z has the scales of the columns: judged in one scaling for rows and columns, another basis looks right."""
+    M, q, z = problems.scaled_apart(np.random.default_rng(decades), 1000, 6, decades)
+    data = [torch.from_numpy(x).to(dtype) for x in (M, q)]
+    solution = solve_lcp(*data, method=method)
+    answer = [x[solution.solved].double().numpy() for x in (*data, solution.z, torch.from_numpy(z))]
+    assert not differs_from_planted(*answer, 4e-6 if dtype is torch.float32 else 1e-10).any()
+    if method == "pivoting" and dtype is torch.float64:
+        assert solution.solved.all()
+
+
+def test_sizes_far_apart_in_q_are_solved_in_each_size():
+    """Contacts whose velocities are 1, 1e-6 and 1e-14 side by side, and 0: the small rows are decided as well."""
+    for seed in range(60):
+        M, q, _ = contact(np.random.default_rng([5, seed]))
+        solution = solve_lcp(torch.from_numpy(M), torch.from_numpy(q))
+        assert solution.solved.all()
+        assert not off_in_rows(M, q, solution.z.numpy(), 1e-10).any()
+
+
+def test_a_large_entry_elsewhere_does_not_hide_a_contact_at_rest():
+    """A contact that pushes with 1e-15 beside one that slides at 1, and beside an inert row of any size."""
+    friction = [[2.0, 1.0, -1.0, 0.0], [1.0, 3.0, -3.0, 1.0], [-1.0, -3.0, 3.0, 1.0], [0.5, -1.0, -1.0, 0.0]]
+    small = torch.tensor([-1e-15, 3e-16, -3e-16, 0.0])
+    for inert in (0.0, 1.0, 1e6):
+        M = torch.block_diag(torch.tensor(friction), torch.zeros(1, 1))
+        solution = solve_lcp(M, torch.cat((small, torch.tensor([inert]))))
+        assert solution.solved
+        torch.testing.assert_close(solution.z[:4], 1e-15 * solve_lcp(M[:4, :4], 1e15 * small).z, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("method", METHODS)

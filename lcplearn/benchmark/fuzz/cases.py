@@ -31,9 +31,9 @@ def batch(seed: int, index: int) -> Batch:
 Made = tuple[np.ndarray, np.ndarray, bool]
 
 
-def _contact(rng: Generator) -> Made:
+def contact(rng: Generator, B: int = 24) -> Made:
     """Friction LCPs with duplicated contacts, frictionless ones, bodies at rest and impulses of size 1 to 1e-14."""
-    B, bodies, contacts = 24, int(rng.integers(1, 4)), int(rng.integers(1, 7))
+    bodies, contacts = int(rng.integers(1, 4)), int(rng.integers(1, 7))
     nv = int(rng.choice([2, 3, 6])) * bodies
     mass = 10.0 ** (rng.choice([0.0, 1.0, 2.0]) * rng.uniform(-1, 1, (B, nv)))
     W = np.eye(nv) / mass[:, None, :]
@@ -99,7 +99,7 @@ def _textbook(rng: Generator) -> Made:
 
 def _mutant(rng: Generator) -> Made:
     """A batch of another kind in which some elements were damaged, a few entries each."""
-    maker = [_contact, _integers, _semidefinite_integers, _units, _textbook][rng.integers(5)]
+    maker = [contact, _integers, _semidefinite_integers, _units, _textbook][rng.integers(5)]
     M, q, _ = maker(rng)
     M, q = np.array(M, dtype=float), np.array(q, dtype=float)
     n = q.shape[-1]
@@ -153,7 +153,7 @@ def _scale_row(rng: Generator, M: np.ndarray, q: np.ndarray, i: int, j: int) -> 
 
 _MUTATIONS = (_nudge, _copy_row, _negate, _special_value, _not_finite, _clear, _scale_row)
 _KINDS: dict[str, Callable[[Generator], Made]] = {
-    "contact": _contact,
+    "contact": contact,
     "integers": _integers,
     "semidefinite integers": _semidefinite_integers,
     "units": _units,

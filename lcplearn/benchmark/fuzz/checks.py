@@ -78,7 +78,8 @@ def residual(M: np.ndarray, q: np.ndarray, z: np.ndarray) -> Residual:
         w = np.where(np.abs(w) < TINY, 0, w)
         scale = np.abs(d * q).max()
         natural = _over(np.abs(np.minimum(z / d, d * w)), scale).max()
-        rows = np.abs(np.minimum(_over(z, z.max()), _over(w, omega))).max()
+        weight = np.maximum(_over(z, z.max()), _over(np.abs(M) * z, omega[:, None]).max(0, initial=0.0))
+        rows = np.abs(np.minimum(weight, _over(w, omega))).max()
         rounding = 4 * len(q) * EPS
         return Residual(float(natural), float(rows), float(rounding * (1 + _over(d * omega, scale).max())), rounding)
 

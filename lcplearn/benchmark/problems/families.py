@@ -97,6 +97,18 @@ def row_column_scaled(rng: np.random.Generator, B: int, n: int, decades: float =
     return Problems(M, np.where(active, 0.0, size * rng.uniform(0.1, 1.0, (B, n))) - Mz, z)
 
 
+def scaled_apart(rng: np.random.Generator, B: int, n: int, decades: float) -> Problems:
+    """R M C and R q with well-conditioned M (M + M' > 0) and R, C powers of two from 10^-decades to 10^decades.
+
+    The planted z = C^-1 z' has the scales of the columns, so that its smallest entries decide as much as its largest.
+    """
+    A, K = rng.standard_normal((2, B, n, n))
+    M, q, z = _plant(rng, A @ A.mT / n + K - K.mT + 0.1 * np.eye(n))
+    r, c = 2.0 ** np.round(rng.uniform(-decades, decades, (2, B, n)) * np.log2(10))
+    assert z is not None
+    return Problems(r[:, :, None] * M * c[:, None, :], r * q, z / c)
+
+
 # --- contact --------------------------------------------------------------------------------------------------------
 
 
