@@ -134,9 +134,8 @@ FIRST = [
              PREDICT, "csv_prediction"),
     Mutation("the summary's worst residual is the best", LCP + "solution.py", "float(solved.max())",
              "float(solved.min())", "tests/lcp/test_solution.py"),
-    Mutation("Lemke's tableau is never asked", LCP + "pivoting.py", "proven = qu <= -1e-9 * size",
-             "proven = qu < -1e300 * size",
-             "tests/lcp/test_solution.py"),
+    Mutation("nothing is proved to be infeasible", LCP + "pivoting.py", "proven = qu <= -margin * size",
+             "proven = qu < -1e300 * size", "tests/lcp/test_solution.py"),
 ]
 
 SECOND = [
@@ -165,7 +164,7 @@ SECOND = [
          "diverges"),
         ("another seed is resumed in silence", TRAINING + "checkpoint.py", "if changed and not allow_changes:",
          "if False:", FIT, "refused_by_name"),
-        ("the data's fingerprint is that of anything", TRAINING + "fitting.py",
+        ("the data's fingerprint is that of anything", TRAINING + "asked.py",
          "digest.update(tensor.detach().cpu().numpy().tobytes())", "pass", FIT, "refused_by_name"),
         ("any module is imported", TRAINING + "checkpoint.py", "if not (trust or module in sys.modules or",
          "if not (True or module in sys.modules or", PREDICT, "trusted"),

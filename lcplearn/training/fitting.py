@@ -1,6 +1,5 @@
 """Train a formulation from Python: data in, figures and checkpoints out."""
 
-import hashlib
 import json
 import logging
 import time
@@ -14,7 +13,6 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-import yaml
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.multiprocessing import ProcessRaisedException
@@ -22,6 +20,7 @@ from torch.utils.data import DataLoader
 
 from lcplearn.datasets import BlockData, WindowLoader, windows
 from lcplearn.formulations import Formulation, Windows, loss_terms
+from lcplearn.training.asked import described_data, described_model, flat, hyperparameters, plain, taken, write_config
 from lcplearn.training.callbacks import (
     BestCheckpoint,
     Divergence,
@@ -31,11 +30,10 @@ from lcplearn.training.callbacks import (
     Report,
     TrainingDivergedError,
 )
-from lcplearn.training.checkpoint import check_resumable, describe, read
+from lcplearn.training.checkpoint import check_resumable, read
 from lcplearn.training.module import VALIDATION, FormulationModule
 from lcplearn.training.optimizer import Optimizer
 from lcplearn.training.results import leave
-from lcplearn.training.settings import FROM_DATA
 from lcplearn.training.writing import AtomicCheckpointIO
 
 DEFAULTS = {"precision": "64-true", "accelerator": "cpu", "devices": 1, "enable_model_summary": False}
@@ -127,9 +125,14 @@ def fit(
     loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
     chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
     every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
-    used = {"seed": seed, "batch_size": batch_size, "optimizer": asdict(optimizer), "data": _data(data, settings)}
+    used = {
+        "seed": seed,
+        "batch_size": batch_size,
+        "optimizer": asdict(optimizer),
+        "data": described_data(data, settings),
+    }
     module = FormulationModule(
-        model, loss=loss, horizon=horizon, optimizer=optimizer, training=_flat(used),
+        model, loss=loss, horizon=horizon, optimizer=optimizer, training=flat(used),
         log_every=every * (len(loader) if batch_size else 1),
     )  # fmt: skip
     best, last = BestCheckpoint(folder, ckpt_path), LastCheckpoint(folder / "last.ckpt", every)
@@ -161,17 +164,17 @@ def fit(
             "horizon": horizon,
             "epochs": epochs,
             "patience": patience,
-            "trainer": {key: _plain(value) for key, value in (trainer or {}).items()},
+            "trainer": {key: plain(value) for key, value in (trainer or {}).items()},
         }
-        says = dict(settings) if settings else {"model": _model(model), **used, **rest}
-        _write_config(folder, says | ({"resumed": resumed} if resumed else {}))
+        says = dict(settings) if settings else {"model": described_model(model), **used, **rest}
+        write_config(folder, says | ({"resumed": resumed} if resumed else {}))
     seconds += _run(lightning_trainer, module, loader, validation, folder, ckpt_path)
     if last.stopped:
         raise TrainingInterrupted(last.path)
     trained, error = _best(module, best)
     if not lightning_trainer.is_global_zero:
         return Result(trained, None, error, folder)
-    shown = _hyperparameters(module, used, epochs)
+    shown = hyperparameters(module, used, epochs)
     return Result(trained, leave(lightning_trainer, trained, data, folder, shown, seconds), error, folder)
 
 
@@ -208,61 +211,6 @@ def _best(module: FormulationModule, best: BestCheckpoint) -> tuple[Formulation,
     return module.model.cpu().eval(), error
 
 
-def _hyperparameters(module: FormulationModule, used: Mapping[str, Any], epochs: int) -> dict[str, Any]:
-    """What tells runs apart, the same names for every model, so that a table of many runs has one column for each."""
-    described = module.described
-    arguments = {name: value for name, value in described["formulation"]["arguments"].items() if name not in FROM_DATA}
-    weights = described["objective"]["loss"]
-    # TensorBoard sorts them by name and shows the first five: numbers make these the five that matter.
-    return {
-        "1 model": described["formulation"]["class"].rpartition(".")[2],
-        "2 seed": used["seed"],
-        "3 noise": used["data"].get("noise", ""),
-        "4 lr": used["optimizer"]["lr"],
-        "5 epochs": epochs,
-        "batch_size": used["batch_size"] or "all",
-        "horizon": module.horizon,
-        "loss": " ".join(f"{name}={weight:g}" for name, weight in weights.items()),
-        "model arguments": " ".join(f"{name}={value}" for name, value in arguments.items()),
-    }
-
-
-def _data(data: BlockData, settings: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The data's settings as far as they are known, and a fingerprint of what is learned from."""
-    digest = hashlib.sha256()
-    for part in (data.train, data.validation):
-        for tensor in part:
-            if tensor is not None:
-                digest.update(tensor.detach().cpu().numpy().tobytes())
-    known = {name: value for name, value in (settings or {}).get("data", {}).items() if name != "path"}
-    return known | {"recordings": digest.hexdigest()[:16]}
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
-
-
-def _write_config(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write config.yaml, which marks the folder as taken: of two runs at once in one folder, the second is refused."""
-    text = yaml.safe_dump(dict(settings), sort_keys=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with (folder / "config.yaml").open("x") as file:
-            file.write(text)
-    except FileExistsError:
-        raise _taken(folder) from None
-
-
-def _plain(value: Any) -> Any:
-    """A callback, as others that are no settings, by the name of its class."""
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return value if value is None or isinstance(value, str | int | float) else type(value).__name__
-
-
 def _plugins(given: Any) -> list[Any]:
     return [] if given is None else list(given) if isinstance(given, list | tuple) else [given]
 
@@ -277,12 +225,8 @@ def _new_folder(folder: str | Path | None) -> Path:
     folder = Path(folder) if folder is not None else Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     # The other processes of strategy=ddp start when the first has already written its settings there.
     if getattr(rank_zero_only, "rank", 0) == 0 and (folder / "config.yaml").exists():
-        raise _taken(folder)
+        raise taken(folder)
     return folder
-
-
-def _taken(folder: Path) -> ValueError:
-    return ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
 
 
 @contextmanager
@@ -297,11 +241,6 @@ def _trainer_errors() -> Iterator[None]:
 def _first(batch: Windows) -> Windows:
     friction = None if batch.friction is None else batch.friction[:1]
     return Windows(batch.velocity[:1], batch.force[:1], friction, batch.valid[:1])
-
-
-def _model(model: Formulation) -> dict[str, Any]:
-    described = describe(model)
-    return {"_target_": described["class"], **described["arguments"]}
 
 
 def _quiet() -> None:
