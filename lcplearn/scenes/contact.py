@@ -4,18 +4,29 @@ A scene gives gaps, Jacobians and a free velocity; `contact_step` finds the velo
 for contacts that close, checks the others afterwards, and adds what it was wrong about. Nothing here knows of shapes.
 """
 
+from types import ModuleType
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lcplearn.scenes.friction_lcp import ROUNDING, Answer, Problem, cone_lcp, frictionless_lcp, polygon_lcp
+from lcplearn.lcp.methods import pivoting_kernel
+from lcplearn.lcp.torch_internals import traced
+from lcplearn.scenes.contact_gradient import attach_gradient
+from lcplearn.scenes.friction_lcp import (
+    DEAD_ZONE,
+    FULL_RANK,
+    MAX_ITERATIONS,
+    ROUNDING,
+    SETTLED,
+    Answer,
+    Problem,
+    cone_lcp,
+    frictionless_lcp,
+    polygon_lcp,
+)
 from lcplearn.scenes.scene import Mode
-
-MAX_ITERATIONS = 40  # of the cone's fixed point; the mean is about 3
-SETTLED = 1e-10  # change of velocity from one iterate to the next, relative to the free velocity, in the mass norm
-DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
 
 RestitutionLaw = Literal["newton", "continuous"]
 
@@ -121,8 +132,8 @@ def contact_step(
         0 <= lambda ⟂ n v' + gap / dt - bounce + compliance lambda >= 0,
         |f| <= mu lambda,  and  f = -mu lambda T v' / |T v'|  where it slips.
 
-    In space the cone is the fixed point of small LCPs (see `friction_lcp`), which are iterated without gradient; the
-    last one alone is differentiated, which is exact there.
+    In space the cone is the fixed point of small LCPs (see `friction_lcp`), iterated without gradient; the gradient is
+    that of the law at the modes that were found (see `contact_gradient`).
 
     Args:
         contacts: What may touch.
@@ -133,25 +144,41 @@ def contact_step(
         rest: Whether a body that sticking contacts hold gets the velocity 0 to the last bit. Gradients don't change.
 
     Gradient:
-        Implicit, with respect to all tensors. With a polygon it is wrong in practice: the velocity is a staircase.
+        Implicit, with respect to all tensors; zero for what is not solved. At a change of mode it is one-sided. With a
+        polygon it is wrong in practice: the velocity is a staircase.
 
     Source: Stewart and Trinkle 1996 (time stepping); NOTES 5.7 (cone, gradient, rest).
     """
     problem, batch = _flatten(contacts, free, mass, dt)
     with torch.no_grad():
-        found, active = _find(Problem(*(x.detach() if isinstance(x, Tensor) else x for x in problem)), polygon)
-        at_rest = _at_rest(problem, found) if rest else torch.zeros_like(found.solved)
-    answer = found._replace(solved=found.solved & problem.excess(found.velocity).isfinite().all(-1))
-    if torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in problem):
-        answer = _differentiable(problem, answer, active, polygon)
-    velocity = answer.velocity
+        kernel = None if polygon is not None else compiled_contacts(free.device)
+        if kernel is None:
+            found, at_rest = find(problem, polygon, rest)
+        else:
+            found, at_rest = kernel.solve(problem, rest)
+    answer = found
+    if torch.is_grad_enabled() and any(x.requires_grad for x in problem):
+        if polygon is not None:
+            answer = _polygon_gradient(problem, found, polygon)
+        else:
+            loaded = found.normal > 0.0
+            answer = attach_gradient(problem, found, _buckets(loaded, loaded.any(-1)))
     # The value is exactly 0, and the gradient that of the computed velocity.
-    velocity = torch.where(at_rest.unsqueeze(-1), velocity - velocity.detach(), velocity)
+    velocity = torch.where(at_rest.unsqueeze(-1), answer.velocity - answer.velocity.detach(), answer.velocity)
     slips = torch.where(found.sticks | at_rest.unsqueeze(-1), int(Mode.STICK), int(Mode.SLIP))
     mode = torch.where(found.normal > 0.0, slips, int(Mode.SEPARATION))
     numbers = (x.to(free.dtype) for x in (velocity, answer.normal, answer.friction))
-    parts = (*numbers, mode, at_rest, answer.solved, found.settled)
+    parts = (*numbers, mode, at_rest, found.solved, found.settled)
     return ContactStep(*(x.reshape((*batch, *x.shape[1:])) for x in parts))
+
+
+def compiled_contacts(device: torch.device) -> ModuleType | None:
+    """`contact_kernel`, imported on first use; None off the CPU, without numba and where a tracer looks on."""
+    if device.type != "cpu" or traced() or pivoting_kernel() is None:
+        return None
+    from lcplearn.scenes import contact_kernel
+
+    return contact_kernel
 
 
 def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple[Problem, torch.Size]:
@@ -178,8 +205,11 @@ def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple
     )
 
 
-def _find(problem: Problem, polygon: int | None) -> tuple[Answer, Tensor]:
-    """Solve with rows for the contacts that close alone; and which these are. Elements with as many go together."""
+def find(problem: Problem, polygon: int | None, rest: bool) -> tuple[Answer, Tensor]:
+    """Solve with rows for the contacts that close alone, then for those it was wrong about; and where it is at rest.
+
+    Elements with equally many rows go together.
+    """
     answer = Answer.free_flight(problem)
     tolerance = ROUNDING * problem.speed_scale()
     new = problem.excess(problem.free) < 0.0
@@ -191,7 +221,8 @@ def _find(problem: Problem, polygon: int | None) -> tuple[Answer, Tensor]:
             answer.put(elements, rows, found)
         new = (problem.excess(answer.velocity) < -tolerance) & ~active
         active = active | new
-    return answer, active
+    answer = answer._replace(solved=answer.solved & problem.excess(answer.velocity).isfinite().all(-1))
+    return answer, _at_rest(problem, answer) if rest else torch.zeros_like(answer.solved)
 
 
 def _buckets(active: Tensor, todo: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -206,13 +237,13 @@ def _buckets(active: Tensor, todo: Tensor) -> list[tuple[Tensor, Tensor]]:
     return result
 
 
-def _once(part: Problem, polygon: int | None, guide: Answer | None = None) -> Answer:
-    """One LCP: what needs no fixed point, or the last iterate of what does, at its directions."""
+def _once(part: Problem, polygon: int | None) -> Answer:
+    """One LCP, for what needs no fixed point."""
     if part.directions == 0:
         return frictionless_lcp(part)
     if polygon is not None and part.directions == 2:
         return polygon_lcp(part, polygon)
-    return cone_lcp(part, guide)
+    return cone_lcp(part, None)
 
 
 def _iterate(part: Problem) -> Answer:
@@ -237,17 +268,16 @@ def _iterate(part: Problem) -> Answer:
     return result
 
 
-def _differentiable(problem: Problem, found: Answer, active: Tensor, polygon: int | None) -> Answer:
-    """The same answer with its gradient: the last LCP, at the directions and speeds that were found."""
+def _polygon_gradient(problem: Problem, found: Answer, polygon: int) -> Answer:
+    """The same answer with its gradient, that of the LCP of the contacts that are loaded."""
     velocity, normal, friction = problem.free, torch.zeros_like(found.normal), torch.zeros_like(found.friction)
-    solved = found.solved
-    for elements, rows in _buckets(active, active.any(-1)):
-        part = _once(problem.pick(elements, rows), polygon, found.pick(elements, rows))
+    loaded = found.normal > 0.0
+    for elements, rows in _buckets(loaded, loaded.any(-1)):
+        part = _once(problem.pick(elements, rows), polygon)
         velocity = velocity.index_put((elements,), part.velocity)
         place = (elements.unsqueeze(-1), rows)
         normal, friction = normal.index_put(place, part.normal), friction.index_put(place, part.friction)
-        solved = solved.index_put((elements,), part.solved & solved[elements])
-    return found._replace(velocity=velocity, normal=normal, friction=friction, solved=solved)
+    return found._replace(velocity=velocity, normal=normal, friction=friction)
 
 
 def _at_rest(problem: Problem, found: Answer) -> Tensor:
@@ -267,6 +297,8 @@ def _at_rest(problem: Problem, found: Answer) -> Tensor:
     kept = torch.cat((touches.unsqueeze(-1), holds.unsqueeze(-1).expand(*holds.shape, directions)), dim=-1)[elements]
     rows = torch.cat((problem.normal.unsqueeze(-2), problem.tangents), dim=-2)[elements]
     rows = (rows * kept.unsqueeze(-1) / problem.mass[elements].sqrt()[:, None, None]).flatten(1, 2)
-    spread = torch.linalg.eigvalsh(rows.mT @ rows)
-    result[elements] = spread[:, 0] > 1e-6 * spread[:, -1]
+    gram = rows.mT @ rows
+    shift = FULL_RANK * gram.diagonal(dim1=-2, dim2=-1).amax(-1)
+    identity = torch.eye(nv, dtype=gram.dtype, device=gram.device)
+    result[elements] = torch.linalg.cholesky_ex(gram - shift[:, None, None] * identity).info == 0
     return result

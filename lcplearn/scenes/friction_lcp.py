@@ -28,6 +28,10 @@ from torch import Tensor
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.numbers import matvec
 
+MAX_ITERATIONS = 40  # of the cone's fixed point; the mean is about 3
+SETTLED = 1e-10  # change of velocity from one iterate to the next, relative to the free velocity, in the mass norm
+DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
+FULL_RANK = 1e-6  # smallest eigenvalue of the rows that hold a body at rest, relative to their largest diagonal
 ROUNDING = 1e-13  # of speeds, relative to those of free flight
 CREEP = 1e-8  # speed that stands for the slip at stick, likewise
 

@@ -12,7 +12,7 @@ from real_data import real_data
 from scenes.contact_scenes import DT, boxes, polygons, violation
 from torch import Tensor
 
-from lcplearn.scenes.contact import Contacts, closing_speed, contact_step, rebound
+from lcplearn.scenes.contact import Contacts, _flatten, closing_speed, compiled_contacts, contact_step, find, rebound
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -199,3 +199,20 @@ def test_published_friction_problems_obey_the_law_of_the_cone():
             assert violation(contacts, free, mass, step) < 1e-7 * scale, name
         right[name] = bool(step.solved & step.settled)
     assert math.fsum(right.values()) >= 0.8 * len(names), right
+
+
+@pytest.mark.parametrize("compliance", [0.0, 1e-3])
+def test_the_compiled_step_is_that_of_torch(compliance):
+    pytest.importorskip("numba")
+    for scene in (polygons(60, 11), boxes(60, 12, compliance=compliance)):
+        problem, _ = _flatten(*scene, DT)
+        compiled, compiled_rest = compiled_contacts(torch.device("cpu")).solve(problem, True)
+        with torch.no_grad():
+            found, at_rest = find(problem, None, True)
+        assert (compiled.solved == found.solved).all()
+        assert (compiled.settled == found.settled).all()
+        assert (compiled_rest == at_rest).all()
+        right = found.solved & found.settled
+        torch.testing.assert_close(compiled.velocity[right], found.velocity[right], rtol=0, atol=1e-12)
+        if compliance:  # else loads are not unique; friction never is
+            torch.testing.assert_close(compiled.normal[right], found.normal[right], rtol=0, atol=1e-11)
