@@ -25,9 +25,9 @@ def _drake(settings: drake.Settings, scene: StickScene, dt: float, mu: float) ->
 
 ENGINES: tuple[Engine, ...] = (
     Engine("lcplearn", "", "rows as each scene needs", partial(ours.simulation, ours.minimal),
-           (1e-2, 4e-3, 2e-3, 1e-3)),
+           (1e-2, 4e-3, 1e-3)),
     Engine("lcplearn body", "", "a box with eight corners in space", partial(ours.simulation, ours.body),
-           (1e-2, 4e-3)),
+           (1e-2,)),
     Engine("MuJoCo", "mujoco", "defaults", partial(_mujoco, mujoco.Settings())),
     Engine("MuJoCo elliptic", "mujoco", "cone=elliptic", partial(_mujoco, mujoco.Settings("elliptic"))),
     Engine("MuJoCo tuned", "mujoco",

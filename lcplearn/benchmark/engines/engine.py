@@ -57,4 +57,4 @@ class Engine(NamedTuple):
     package: str
     settings: str
     build: Callable[[StickScene, float, float], Simulation | None]
-    step_sizes: tuple[float, ...] = (1e-2, 4e-3, 2e-3, 1e-3, 5e-4)
+    step_sizes: tuple[float, ...] = (1e-2, 2e-3, 5e-4)
