@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from lcplearn.benchmark.scenes.cases import DURATION, SCENES, exact, random_states, start
+from lcplearn.benchmark.scenes.contact_cases import body_rows, curve_rows
 from lcplearn.benchmark.scenes.run import motion_errors, motion_rows, roll, step_rows
 
 ROWS = {"sliding block": 2, "one-way block": 1, "falling block": 1, "bouncing block": 1}
@@ -89,3 +90,19 @@ def test_a_sliding_block_stops_within_half_a_step_of_its_start_speed():
     assert errors["end_error"] == pytest.approx(2.0 * dt / 2, rel=0.05)
     assert errors["energy_error"] < 1e-12
     assert path[-1, 1] == 0
+
+
+def test_a_body_builds_a_fraction_of_its_rows_and_finer_polygons_come_nearer_to_the_cone():
+    hexagon = body_rows("hexagon in its plane", 16, 1, 0)[0]
+    assert 0 < hexagon["rows"] < 0.5 * hexagon["full_rows"]
+    cone, *polygons = body_rows("box in space", 16, 1, 0)
+    assert cone["rows"] < 0.5 * cone["full_rows"] < 0.5 * polygons[0]["full_rows"]
+    assert cone["solved"] == 1
+    distances = [row["velocity_difference"] for row in (cone, *polygons[::-1])]
+    assert distances == sorted(distances)
+
+
+def test_a_curved_slide_converges_by_the_exact_cone_and_not_by_a_polygon():
+    coarse, fine = ({row["formulation"]: row["position_error"] for row in curve_rows(dt, 1)} for dt in (1e-2, 1e-3))
+    assert fine["exact cone"] < 0.15 * coarse["exact cone"]
+    assert fine["polygon of 8"] > 0.5 * coarse["polygon of 8"]

@@ -81,3 +81,39 @@ def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
     right.legend(fontsize=8, frameon=False, loc="lower left")
     right.set_title("error against time (rows of the LCP)", fontsize=10)
     return figure
+
+
+CONE_LOOKS = (Style(GREEN, "^"), Style(BLUE, "o"), Style(SKY, "v", "--"), Style(RED, "s", ":"))
+
+
+def cone_bars(rows: Sequence[Row], limit: float) -> "Figure":
+    """Distance from the exact cone against time of a step, a point a batch; in units of the friction limit."""
+    figure, axes = new_figure(width=6.5, height=4.2)
+    box = [row for row in rows if row["scene"] == "box in space"]
+    for name, look in zip(dict.fromkeys(str(row["formulation"]) for row in box), CONE_LOOKS, strict=False):
+        own = [row for row in box if row["formulation"] == name]
+        x = [float(row["step_us"]) for row in own]
+        y = [float(row["velocity_difference"]) / limit for row in own]
+        axes[0, 0].plot(x, y, color=look.color, marker=look.marker, linestyle=look.linestyle, label=name)
+        for row, a, b in zip(own, x, y, strict=True):
+            axes[0, 0].annotate(f"{row['batch']:g}", (a, b), (3, 4), textcoords="offset points", fontsize=7)
+    axes[0, 0].set(xscale="log", xlabel="time of a step of one body [µs] (numbers: batch)")
+    axes[0, 0].set_ylabel("rms distance from the exact cone [mu g dt]")
+    axes[0, 0].set_title("box in space, on a face, an edge or a corner", fontsize=10)
+    axes[0, 0].legend(fontsize=8, frameon=False)
+    return figure
+
+
+def curve_lines(rows: Sequence[Row]) -> "Figure":
+    """Error of a curved slide against step size and against time."""
+    figure, axes = new_figure(1, 2, width=8.0, height=3.9)
+    for ax, column, label in zip(axes[0], ("dt", "seconds"), ("step size dt [s]", "CPU time of a trajectory [s]"),
+                                 strict=True):  # fmt: skip
+        for name, look in zip(dict.fromkeys(str(row["formulation"]) for row in rows), CONE_LOOKS, strict=False):
+            own = [row for row in rows if row["formulation"] == name]
+            ax.loglog([float(r[column]) for r in own], [float(r["position_error"]) for r in own], label=name,
+                      color=look.color, marker=look.marker, linestyle=look.linestyle, markersize=4)  # fmt: skip
+        ax.set_xlabel(label)
+    axes[0, 0].set_ylabel("largest position error [m]")
+    one_legend(figure, axes)
+    return figure

@@ -19,15 +19,17 @@ from lcplearn.benchmark.scenes.cases import (
     random_states,
     start,
 )
-from lcplearn.benchmark.scenes.figures import error_time, time_bars
+from lcplearn.benchmark.scenes.contact_cases import CURVED, DT, MU, body_rows, body_scenes, curve_rows
+from lcplearn.benchmark.scenes.figures import cone_bars, curve_lines, error_time, time_bars
 
 KEY = ("part", "scene", "dt", "batch")
 COLUMNS = (
-    "formulation", "rows", "velocity_difference", "step_us", "step_low_us", "step_high_us", "full_over_this", "steps",
-    "seconds", "position_error", "end_error", "energy_error", "penetration",
+    "formulation", "rows", "full_rows", "velocity_difference", "step_us", "step_low_us", "step_high_us",
+    "full_over_this", "steps", "seconds", "position_error", "end_error", "energy_error", "penetration", "solved",
 )  # fmt: skip
 STEP_SIZES = tuple(10.0 ** (-k / 3) for k in range(3, 13))  # [s] 0.1 to 1e-4
 BATCHES = (1, 100, 10_000)
+BODY_BATCHES = (1, 64, 1000)
 
 
 def run(options: Options) -> None:
@@ -36,10 +38,14 @@ def run(options: Options) -> None:
     for key in study.remaining(plan(options.quick), seconds=expected_seconds):
         part, scene, dt, batch = key
         if part == "step":
-            rows = step_rows(str(scene), float(dt), int(batch), 15 if options.quick else 51, options.seed)
+            rows = [*step_rows(str(scene), float(dt), int(batch), 15 if options.quick else 51, options.seed).values()]
+        elif part == "motion":
+            rows = [*motion_rows(str(scene), float(dt), 3 if options.quick else 7).values()]
+        elif part == "body":
+            rows = body_rows(str(scene), int(batch), 3 if options.quick else 7, options.seed)
         else:
-            rows = motion_rows(str(scene), float(dt), 3 if options.quick else 7)
-        study.add(key, *rows.values())
+            rows = curve_rows(float(dt), 1 if options.quick else 5)
+        study.add(key, *rows)
     report(study)
 
 
@@ -48,10 +54,17 @@ def plan(quick: bool) -> Iterable[tuple[Any, ...]]:
     for scene in SCENES:
         yield from (("step", scene, 0.01, batch) for batch in BATCHES[: 2 if quick else 3])
         yield from (("motion", scene, dt, 1) for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1])
+    for scene in body_scenes():
+        yield from (("body", scene, DT, batch) for batch in BODY_BATCHES[: 2 if quick else 3])
+    yield from (("curve", CURVED.name, dt, 1) for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1])
 
 
 def expected_seconds(part: Any, scene: Any, dt: Any, batch: Any) -> float:
     """Rough cost of a key of the full run."""
+    if part == "body":
+        return 2.0 + 5e-3 * float(batch)
+    if part == "curve":
+        return 24 * 1e-4 * CURVED.duration / float(dt)
     each = 0.3 + 1e-4 * batch if part == "step" else 8 * 8e-5 * DURATION / dt
     return each * len(SCENES[scene])
 
@@ -169,6 +182,7 @@ def report(study: Study) -> None:
         table=Table(("scene", "formulation", "rows", "velocity difference [m/s]", *heads), table),
         figure=time_bars(steps),
     )
+    _say_bodies(study)
     for scene in SCENES:
         of_scene = [row for row in motions if row["scene"] == scene]
         study.say(
@@ -178,6 +192,33 @@ def report(study: Study) -> None:
             figure=error_time(scene, of_scene),
         )
     study.finish()
+
+
+def _say_bodies(study: Study) -> None:
+    """Bodies with several contacts, and the exact cone."""
+    bodies = [row for row in study.rows if row["part"] == "body"]
+    columns = ("scene", "formulation", "batch", "full_rows", "rows", "velocity_difference", "step_us", "solved")
+    heads = ("scene", "friction", "batch", "rows of all corners", "rows needed", "from the exact cone [m/s]",
+             "step [us]", "solved")  # fmt: skip
+    study.say(
+        "What does the exact friction cone cost, and what do polygons miss?",
+        "Random states that touch the ground, one step: rows of all corners and those that a step needs (mean), "
+        f"rms distance of the velocity from that of the exact cone (mu g dt is {MU * 9.81 * DT:.3g} m/s), CPU time.",
+        table=Table(heads, [tuple(row[column] for column in columns) for row in bodies]),
+        figure=cone_bars(bodies, MU * 9.81 * DT),
+    )
+    curves = [row for row in study.rows if row["part"] == "curve"]
+    study.say(
+        "Which step size and friction for a slide that curves?",
+        "A block starts along the contour of a slope of 20 degrees with mu = 0.6 and curves down to a stop. The exact "
+        "disc of friction converges with the step size, a polygon of facets only to its own error.",
+        table=Table(
+            ("dt [s]", "friction", "position error [m]", "end error [m]", "trajectory [ms]"),
+            [(float(r["dt"]), r["formulation"], r["position_error"], r["end_error"], 1e3 * float(r["seconds"]))
+             for r in curves],
+        ),
+        figure=curve_lines(curves),
+    )  # fmt: skip
 
 
 END_ERROR = {
