@@ -96,8 +96,9 @@ def test_a_shared_matrix_and_a_single_problem_are_finished_on_the_cpu_too():
 
 @pytest.mark.parametrize("smoothing", [0.0, 1e-3])
 @pytest.mark.parametrize("family", ["semidefinite", "nonsymmetric P"])
-def test_answers_do_not_depend_on_how_often_the_device_is_asked(family, smoothing):
+def test_answers_do_not_depend_on_how_often_the_device_is_asked(family, smoothing, monkeypatch):
     """The CPU asks after each round, `follow_path` never."""
+    monkeypatch.setattr(interior_point, "ROUNDS_AT_ONCE", 5)
     M, q = problem(family, batch=32)
     asked = interior_point.interior_point(M, q, max_iter=20, smoothing=smoothing)
     unasked = interior_point.follow_path(M, q, max_iter=20, smoothing=smoothing)
