@@ -1,6 +1,6 @@
 """Break the code in one place at a time and see whether a test notices.
 
-python tests/mutate.py [--only WORD] [--list]
+python tests/mutate.py [--only WORD] [--skip WORD] [--list]
 
 The mutations stand in tests/mutations.py. Each is applied to a copy of the working tree, in which the tests that guard
 it are run. Exit status 1 if one survives, or if its text is no longer found.
@@ -106,11 +106,14 @@ def judge(mutation: Mutation, tree: Path, limit: float, unbroken: dict[tuple[str
 def main() -> None:
     """Run the mutations and print the score."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", metavar="WORD", help="those whose file, claim or origin has the word")
+    parser.add_argument("--only", default="", metavar="WORD", help="those in whose entry the word stands")
+    parser.add_argument("--skip", metavar="WORD", help="all but those in whose entry the word stands")
+    parser.add_argument("--passing", action="store_true", help="the tests are known to pass: do not run them unbroken")
     parser.add_argument("--list", action="store_true", help="only say which there are, and which are stale")
-    parser.add_argument("--limit", type=float, default=300.0, help="seconds for the tests of one")
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds for the tests of one")
     options = parser.parse_args()
-    chosen = [each for each in MUTATIONS if options.only in f"{each.file} {each.breaks} {each.origin}"]
+    chosen = [each for each in MUTATIONS if options.only in (text := " ".join(map(str, each)))
+              and not (options.skip and options.skip in text)]  # fmt: skip
     chosen.sort(key=lambda each: "pivoting" in each.file or "kernel" in each.file)  # they compile it anew
     if not options.list:
         os.environ |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
@@ -127,6 +130,8 @@ def main() -> None:
             if mutation.equivalent or options.list:
                 result = ("equivalent" if mutation.equivalent else "caught") if found else "stale"
             else:
+                if options.passing:
+                    unbroken[mutation.tests, mutation.keyword] = 0
                 result = judge(mutation, tree, options.limit, unbroken)
             counts[result] += 1
             word = ("there" if result != "stale" else result) if options.list else result
