@@ -43,13 +43,15 @@ def train(config: DictConfig) -> float:
     from lightning import seed_everything
     from lightning.pytorch.utilities import rank_zero_only
 
+    from lcplearn.formulations import build
     from lcplearn.training import TrainingDivergedError, TrainingInterrupted, fit
     from lcplearn.training.metrics import describe_model, format_table
 
     torch.set_num_threads(config.threads)
     seed_everything(config.seed, verbose=False)
     data = hydra.utils.instantiate(config.data, _convert_="all")
-    model = hydra.utils.instantiate(config.model, dt=data.dt, gravity=data.gravity, _convert_="all")
+    asked = hydra.utils.instantiate(config.model, _partial_=True, _convert_="all")
+    model = build(asked.func, data, **asked.keywords)
     loss, trainer = dict(settings["loss"]), dict(settings["trainer"])
     rank_zero_only(print)(describe_model(model, data))
     try:

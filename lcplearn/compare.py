@@ -17,39 +17,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import yaml
 from hydra.experimental.callback import Callback
 
+from lcplearn.training.figures_of_merit import KEYS, figure, in_order
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Value = float | None
 # Settings that change nothing in what is learned; any other difference makes another row.
 _SILENT = ("seed", "data.seed", "ckpt_path", "allow_changes", "logger.", "trainer.enable_progress_bar", "resumed.from")
-_HEADERS = {
-    "velocity_rmse": "one-step [m/s]",
-    "stick_accuracy": "stick",
-    "false_stick": "false stick",
-    "rollout_rmse_100": "100 steps",
-    "rollout_rmse_1000": "1000 steps",
-    "mu_error": "mu error",
-    "mass_error": "mass error",
-    "stop_error_median_mm": "stop [mm]",
-    "stop_error_p90_mm": "stop p90",
-    "rest_share": "at rest",
-    "unsolved_share": "unsolved",
-    "mu": "mu",
-    "parameters": "parameters",
-    "train_seconds": "train [s]",
-    "predict_us": "step [us]",
-}
 # The far error that a picture shows: the first of these that a run has.
 _FAR = {
     "stop_error_median_mm": "where a slide stops: median error [mm]",
     "rollout_rmse_1000": "error over 1000 steps [m/s]",
     "rollout_rmse_100": "error over 100 steps [m/s]",
 }
-
-
-# Figures of which more is better; of all others less is, or neither.
-_MORE_IS_BETTER = ("stick_accuracy", "rest_share")
 
 
 class Row(NamedTuple):
@@ -98,11 +79,11 @@ def read_runs(folders: Iterable[str | Path]) -> list[Row]:
 
 def format_table(rows: Sequence[Row]) -> str:
     """A markdown table of the figures that any row has."""
-    keys = [key for key in _HEADERS if any(row.values.get(key) is not None for row in rows)]
+    keys = in_order(key for row in rows for key, value in row.values.items() if value is not None)
     counts = ["seeds"]
     counts += ["runs"] if any(row.runs != row.seeds for row in rows) else []
     counts += ["diverged"] if any(row.diverged for row in rows) else []
-    cells = [["run", *counts, *(_HEADERS[key] for key in keys)]]
+    cells = [["run", *counts, *(figure(key).heading for key in keys)]]
     for row in rows:
         numbers = {"seeds": str(row.seeds), "runs": str(row.runs), "diverged": f"{row.diverged} of {row.runs}"}
         label = row.label.replace("|", "\\|")  # a bare one would end the cell
@@ -228,12 +209,12 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def _row(label: str, configs: Sequence[Mapping[str, Any]], runs: Sequence[Mapping[str, Any]]) -> Row:
     values: dict[str, Value] = {}
     extremes = {}
-    for key in _HEADERS:
+    for key in in_order((*KEYS, *(key for run in runs for key in run if key != "diverged"))):
         found = [_figure(run.get(key)) for run in runs]
         if all(value is None for value in found):
             values[key] = None
             continue
-        worst = -math.inf if key in _MORE_IS_BETTER else math.inf
+        worst = -math.inf if figure(key).more_is_better else math.inf
         # Equal settings ask for equal figures: a run without one has diverged.
         counted = [worst if value is None or math.isinf(value) else value for value in found]
         # The higher or lower of two middle ones, not their mean: half a diverged pair is no figure.

@@ -1,8 +1,10 @@
 """Predict with a trained model: python -m lcplearn.predict CHECKPOINT --input forces.csv --output motion.csv
 
-CSV input has a header and a column `force` [N], one row a time step; models that need measured friction also read
+CSV input has a header and a column `force` [N] (`force_1`, `force_2`, ... for models of several velocities), one row a
+time step; models that need measured friction also read
 `friction_plus` and `friction_minus` [N]; a column `time_s` or `time` [s] must have the model's steps. NPZ input has
-`forces` [T], [T, 1] or [N, T], and may have `friction` [..., T, 2], `state` [..., 2] and `dt` [s]. `--score DATA`
+`forces` [T, nv] or [N, T, nv], without nv where it is 1, and may have `friction` [..., T, 2], `state` [..., nq + nv]
+and `dt` [s]. `--score DATA`
 judges the model on recordings instead: cube_slides.npz, or an NPZ file with `dt` and the arrays of
 lcplearn.datasets.Recordings.
 """
@@ -21,10 +23,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.datasets import BlockData, read_all_cube_slides, read_recordings
+from lcplearn.datasets import Task, read_all_cube_slides, read_recordings
 from lcplearn.datasets.files import find, positive_number, read_npz
 from lcplearn.formulations import Formulation
-from lcplearn.scenes.rollout import Mode, Trajectory
+from lcplearn.scenes.scene import Mode, Trajectory
+from lcplearn.scenes.space import LINE, Space
 from lcplearn.training.checkpoint import load
 
 FRICTION = ("friction_plus", "friction_minus")
@@ -37,18 +40,22 @@ class Inputs(NamedTuple):
     Attributes:
         forces: Force of each step [N].
         friction: Measured friction of each step [N], None if there is none.
-        state: Position [m] and velocity [m/s] at the start, None if the file has none.
+        state: Positions, then velocities, at the start, None if the file has none.
         dt: Time of a step [s], None if the file has none.
     """
 
-    forces: Float[Tensor, "*batch T 1"]
+    forces: Float[Tensor, "*batch T nv"]
     friction: Float[Tensor, "*batch T 2"] | None
-    state: Float[Tensor, "*batch 2"] | None
+    state: Float[Tensor, "*batch nq_plus_nv"] | None
     dt: float | None = None
 
 
-def read_inputs(path: str | Path) -> Inputs:
+def read_inputs(path: str | Path, space: Space = LINE) -> Inputs:
     """Read forces, and what else stands there, from a CSV or NPZ file.
+
+    Args:
+        path: The file.
+        space: Of the model that will be driven.
 
     Raises:
         ValueError: one sentence on what is wrong with the file.
@@ -56,9 +63,12 @@ def read_inputs(path: str | Path) -> Inputs:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"There is no input file {path}.")
-    arrays = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix, _unknown)(path)
+    if path.suffix not in (".csv", ".npz"):
+        _unknown(path)
+    arrays = _read_npz(path) if path.suffix == ".npz" else _read_csv(path, _force_names(space))
     if "forces" not in arrays:
-        raise ValueError(f"{path} has no column 'force'; it has {', '.join(arrays) or 'nothing'}.")
+        missing = next(name for name in _force_names(space) if name not in arrays)
+        raise ValueError(f"{path} has no column '{missing}'; it has {', '.join(arrays) or 'nothing'}.")
     tensors = {key: torch.as_tensor(value, dtype=torch.float64) for key, value in arrays.items()}
     forces, friction, state = tensors["forces"], tensors.get("friction"), tensors.get("state")
     for name, tensor in (("forces", forces), ("friction", friction), ("state", state)):
@@ -66,28 +76,29 @@ def read_inputs(path: str | Path) -> Inputs:
             raise ValueError(f"{path}: {name} must be finite numbers.")
     if forces.ndim == 0 or forces.shape[-1] == 0 or forces.numel() == 0:
         raise ValueError(f"{path}: forces must have at least one step.")
-    if forces.ndim > 1 and forces.shape[-1] == 1:  # as model.rollout takes them
-        forces = forces[..., 0]
-    if forces.ndim > 2:
-        raise ValueError(
-            f"{path}: forces must have shape [T], [T, 1], [N, T] or [N, T, 1], got {list(tensors['forces'].shape)}."
-        )
-    if friction is not None and friction.shape != (*forces.shape, 2):
-        raise ValueError(f"{path}: friction must have shape {[*forces.shape, 2]}, got {list(friction.shape)}.")
-    if state is not None and state.shape not in ((2,), (*forces.shape[:-1], 2)):
-        raise ValueError(f"{path}: state must have shape {[*forces.shape[:-1], 2]} or [2], got {list(state.shape)}.")
+    if space.nv == 1 and not (forces.ndim > 1 and forces.shape[-1] == 1):
+        forces = forces[..., None]
+    if forces.ndim not in (2, 3) or forces.shape[-1] != space.nv:
+        wanted = "[T], [T, 1], [N, T] or [N, T, 1]" if space.nv == 1 else f"[T, {space.nv}] or [N, T, {space.nv}]"
+        raise ValueError(f"{path}: forces must have shape {wanted}, got {list(tensors['forces'].shape)}.")
+    steps, columns = forces.shape[:-1], space.nq + space.nv
+    if friction is not None and friction.shape != (*steps, 2):
+        raise ValueError(f"{path}: friction must have shape {[*steps, 2]}, got {list(friction.shape)}.")
+    if state is not None and state.shape not in ((columns,), (*steps[:-1], columns)):
+        wanted = f"{[*steps[:-1], columns]} or [{columns}]"
+        raise ValueError(f"{path}: state must have shape {wanted}, got {list(state.shape)}.")
     dt = tensors.get("dt")
-    return Inputs(forces[..., None], friction, state, None if dt is None else positive_number(path, "dt", dt.numpy()))
+    return Inputs(forces, friction, state, None if dt is None else positive_number(path, "dt", dt.numpy()))
 
 
 @torch.no_grad()
-def predict(model: Formulation, inputs: Inputs, state: Float[Tensor, "*batch 2"] | None = None) -> Trajectory:
+def predict(model: Formulation, inputs: Inputs, state: Float[Tensor, "*batch nq_plus_nv"] | None = None) -> Trajectory:
     """Roll the model out.
 
     Args:
         model: A trained model.
         inputs: Forces, and friction where the model needs it.
-        state: Position [m] and velocity [m/s] at the start; the inputs' own, else rest at 0, by default.
+        state: Positions, then velocities, at the start; the inputs' own, else rest at 0, by default.
 
     Raises:
         ValueError: the model needs measured friction and the inputs have none, their time step is another than the
@@ -103,36 +114,41 @@ def predict(model: Formulation, inputs: Inputs, state: Float[Tensor, "*batch 2"]
             "or an array 'friction' in an NPZ file."
         )
     if state is None:
-        state = inputs.state if inputs.state is not None else torch.zeros(2, dtype=torch.float64)
+        state = inputs.state if inputs.state is not None else model.space.origin()
     if not bool(state.isfinite().all()):
-        raise ValueError(f"state: expected finite position and velocity, got {state.tolist()}.")
+        raise ValueError(f"state: expected finite positions and velocities, got {state.tolist()}.")
     return model.rollout(state, inputs.forces, inputs.friction if model.needs_friction else None)
 
 
-def write(path: str | Path, trajectory: Trajectory, dt: float) -> None:
-    """Write a trajectory as CSV (one trajectory only) or NPZ.
+def write(path: str | Path, trajectory: Trajectory, model: Formulation) -> None:
+    """Write a trajectory as CSV (one trajectory only) or NPZ; the model's space names the columns.
 
     Raises:
         ValueError: several trajectories for a CSV file, or another kind of file.
     """
     path = Path(path)
-    positions, velocities, mode = (tensor[..., 0].numpy() for tensor in trajectory[:3])
-    time = np.arange(positions.shape[-1]) * dt
+    positions, velocities, mode = (tensor.numpy() for tensor in trajectory[:3])
+    time = np.arange(positions.shape[-2]) * model.dt
     if path.suffix == ".npz":
+        if model.space.nv == 1:
+            positions, velocities, mode = positions[..., 0], velocities[..., 0], mode[..., 0]
         np.savez(path, time=time, positions=positions, velocities=velocities, mode=mode)
         return
     if path.suffix != ".csv":
         _unknown(path)
-    if positions.ndim > 1:
+    if positions.ndim > 2:
         raise ValueError(f"{path}: a CSV file holds one trajectory, not {len(positions)}; write .npz instead.")
-    names = ["", *(Mode(value).name.lower() for value in mode.tolist())]
+    contacts = mode.shape[-1]
+    names = [[""] * contacts, *([Mode(value).name.lower() for value in row] for row in mode.tolist())]
+    modes = ["mode"] if contacts == 1 else [f"mode_{k}" for k in range(1, contacts + 1)]
+    rows = zip(time.tolist(), positions.tolist(), velocities.tolist(), names, strict=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(("time_s", "position_m", "velocity_m_s", "mode"))
-        writer.writerows(zip(time.tolist(), positions.tolist(), velocities.tolist(), names, strict=True))
+        writer.writerow(("time_s", *model.space.positions, *model.space.velocities, *modes))
+        writer.writerows((instant, *position, *velocity, *name) for instant, position, velocity, name in rows)
 
 
-def read_data(path: str | Path, model: Formulation) -> BlockData:
+def read_data(path: str | Path, model: Formulation) -> Task:
     """Read recordings to score a model on; all of them are the test.
 
     Raises:
@@ -142,10 +158,15 @@ def read_data(path: str | Path, model: Formulation) -> BlockData:
     if not Path(path).exists() and str(Path(path).parent) in (".", "data"):
         path = find(Path(path).name)  # where train.py looks
     slides = "offsets" in read_npz(path, (), optional=("offsets",))
-    data = read_all_cube_slides(path) if slides else read_recordings(path, gravity=model.gravity)
+    truth = tuple(model.physical_parameters())
+    data = (
+        read_all_cube_slides(path)
+        if slides
+        else read_recordings(path, space=model.space, given=model.given, truth=truth)
+    )
     if abs(data.dt / model.dt - 1.0) > 1e-9:
         raise ValueError(f"{path} has time steps of {data.dt:.6g} s, but the model was trained for {model.dt:.6g} s.")
-    if model.needs_friction and data.test.friction is None:
+    if model.needs_friction and data.test.drive.friction is None:
         raise ValueError(f"{type(model).__name__} needs measured friction, and {path} has no array 'friction'.")
     return data
 
@@ -160,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what.add_argument("--input", help="forces, CSV or NPZ")
     what.add_argument("--score", metavar="DATA", help="recordings to judge the model on, NPZ")
     parser.add_argument("--output", help="where to write: motion as CSV or NPZ, or the score as JSON")
-    parser.add_argument("--state", nargs=2, type=float, metavar=("POSITION", "VELOCITY"), help="start [m, m/s]")
+    parser.add_argument("--state", nargs="+", type=float, metavar="NUMBER", help="start: positions, then velocities")
     parser.add_argument("--plot", metavar="PICTURE", help="picture of the motion: PNG, PDF or SVG")
     parser.add_argument(
         "--trust", action="store_true", help="import the model's class from any module that the file names"
@@ -180,16 +201,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _predict(options: argparse.Namespace) -> None:
     model = load(options.checkpoint, "cpu", trust=options.trust)
     state = None if options.state is None else torch.tensor(options.state, dtype=torch.float64)
-    inputs = read_inputs(options.input)
+    inputs = read_inputs(options.input, model.space)
     trajectory = predict(model, inputs, state)
     steps, stuck = trajectory.mode.shape[-2], float((trajectory.mode == Mode.STICK).double().mean())
     for path in (options.output, options.plot):
         if path:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
     if options.output:
-        write(options.output, trajectory, model.dt)
+        write(options.output, trajectory, model)
     if options.plot:
-        _draw(inputs, trajectory, model.dt).savefig(options.plot, dpi=120)
+        _draw(inputs, trajectory, model).savefig(options.plot, dpi=120)
     several = f"{len(trajectory.mode)} trajectories of " if trajectory.mode.ndim > 2 else ""
     print(
         f"{type(model).__name__}: {several}{steps} step{'s' * (steps > 1)} of {model.dt:.4g} s, "
@@ -208,33 +229,41 @@ def _score(options: argparse.Namespace) -> None:
         write_figures(options.output, metrics)
 
 
-def _draw(inputs: Inputs, trajectory: Trajectory, dt: float) -> Any:
+def _draw(inputs: Inputs, trajectory: Trajectory, model: Formulation) -> Any:
     from matplotlib.figure import Figure
 
     from lcplearn.training.figures import strip
 
     figure = Figure(figsize=(8.0, 6.0), layout="constrained")
+    line = model.space.nv == 1
     rows = [
-        ("force [N]", inputs.forces[..., 0]),
-        ("velocity [m/s]", trajectory.velocities[..., 0]),
-        ("position [m]", trajectory.positions[..., 0]),
+        ("force [N]" if line else "force [N, N m]", inputs.forces),
+        ("velocity [m/s]" if line else "velocity [m/s, rad/s]", trajectory.velocities),
+        ("position [m]" if line else "position", trajectory.positions),
     ]
-    time = torch.arange(trajectory.positions.shape[-2]) * dt
+    time = torch.arange(trajectory.positions.shape[-2]) * model.dt
     axes = figure.subplots(3, 1, sharex=True)
     for ax, (label, values) in zip(axes, rows, strict=True):
-        series = values.reshape(-1, values.shape[-1])
-        for line in series[:10]:
-            ax.stairs(line, time, baseline=None, linewidth=1.5) if label.startswith("force") else ax.plot(time, line)
+        for series in values.transpose(-1, -2).reshape(-1, values.shape[-2])[:10]:
+            if label.startswith("force"):
+                ax.stairs(series, time, baseline=None, linewidth=1.5)
+            else:
+                ax.plot(time, series)
         ax.set_ylabel(label)
         ax.grid(alpha=0.3)
     ax.set_xlabel("time [s]")
     if trajectory.velocities.ndim == 2:
-        strip(axes[1], time, trajectory.velocities[:, 0], 0.02, "tab:red", "at rest")
+        speed = model.space.speed(trajectory.velocities, model.radius)
+        strip(axes[1], time, speed, 0.02, "tab:red", "at rest")
         axes[1].legend(fontsize=8)
     return figure
 
 
-def _read_csv(path: Path) -> dict[str, Any]:
+def _force_names(space: Space) -> list[str]:
+    return ["force"] if space.nv == 1 else [f"force_{k}" for k in range(1, space.nv + 1)]
+
+
+def _read_csv(path: Path, names: Sequence[str]) -> dict[str, Any]:
     """Columns of numbers; whatever else stands in the file is refused, with its line."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a file with a byte order mark
@@ -248,7 +277,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
     twice = sorted({name for name in header if header.count(name) > 1})
     if twice:
         raise ValueError(f"{path}, line 1: there are several columns '{twice[0]}'.")
-    if "force" not in header:
+    if not set(names) <= set(header):
         return dict.fromkeys(header)
     for line, cells in lines:
         if not any(cell.strip() for cell in cells):
@@ -261,7 +290,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
         index = header.index(name)
         return [_number(cells[index], f"{path}, line {line}: {name}") for line, cells in lines]
 
-    arrays: dict[str, Any] = {"forces": column("force")}
+    arrays: dict[str, Any] = {"forces": np.array([column(name) for name in names]).T}
     if set(FRICTION) <= set(header):
         arrays["friction"] = np.array([column(name) for name in FRICTION]).T
     clock = next((name for name in TIME if name in header), None)

@@ -7,7 +7,7 @@ import pytest
 
 import lcplearn
 
-LAYERS = ("lcp", "scenes", "formulations", "datasets", "training")
+LAYERS = ("lcp", "scenes", "datasets", "formulations", "training")
 ROOT = Path(lcplearn.__file__).parent
 
 
@@ -25,7 +25,7 @@ def imported(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_layer_imports_only_from_those_before_it(layer):
-    """Architecture: lcp < scenes < formulations < datasets < training < commands."""
+    """Architecture: lcp < scenes < datasets < formulations < training < commands."""
     below = {"predict", "compare", "benchmark", *LAYERS[LAYERS.index(layer) + 1 :]}
     wrong = {path.name: imported(path) & below for path in (ROOT / layer).rglob("*.py")}
     assert wrong

@@ -7,7 +7,10 @@ import torch
 from numpy.typing import NDArray
 
 from lcplearn.datasets.files import check_offsets, find, positive_number, read_npz
-from lcplearn.datasets.recordings import BlockData, Recordings
+from lcplearn.datasets.recordings import Recordings
+from lcplearn.datasets.task import Task
+from lcplearn.scenes.scene import Drive
+from lcplearn.scenes.space import LINE
 
 FILE = "cube_slides.npz"
 COLUMNS = ("t_s", "s_m", "v_m_s", "lateral_m", "z_m", "yaw_rate_rad_s")
@@ -15,7 +18,7 @@ COLUMNS = ("t_s", "s_m", "v_m_s", "lateral_m", "z_m", "yaw_rate_rad_s")
 
 def read_cube_slides(
     path: Path | str | None = None, *, seed: int = 0, training_slides: int = 40, validation_slides: int = 8
-) -> BlockData:
+) -> Task:
     """Real slides of a cube to rest, split at random by slide.
 
     No force acts but gravity and friction, so that only mu can be learned: mass is the published one.
@@ -27,7 +30,7 @@ def read_cube_slides(
         validation_slides: How many of these validate instead of train.
 
     Returns:
-        The data; mu is None, because nobody knows it.
+        The data; nobody knows the true friction coefficient.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -43,18 +46,11 @@ def read_cube_slides(
         )
     slides = [slides[k] for k in torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()]
     learning = training_slides - validation_slides
-    return BlockData(
-        kind="cube_slides",
-        train=_recordings(slides[:learning]),
-        validation=_recordings(slides[learning:training_slides]),
-        test=_recordings(slides[training_slides:]),
-        test_long=None,
-        mu=None,
-        **constants,
-    )
+    parts = (slides[:learning], slides[learning:training_slides], slides[training_slides:])
+    return _task([_recordings(part) for part in parts], constants)
 
 
-def read_all_cube_slides(path: Path | str) -> BlockData:
+def read_all_cube_slides(path: Path | str) -> Task:
     """Real slides as `read_cube_slides` has them, but all of them in each part: to score a model that is trained.
 
     Raises:
@@ -63,7 +59,13 @@ def read_all_cube_slides(path: Path | str) -> BlockData:
     """
     slides, constants = _read(Path(path))
     everything = _recordings(slides)
-    return BlockData("cube_slides", everything, everything, everything, None, mu=None, **constants)
+    return _task([everything] * 3, constants)
+
+
+def _task(parts: list[Recordings], constants: dict[str, float]) -> Task:
+    dt, given = constants["dt"], {name: constants[name] for name in ("gravity", "mass")}
+    train, validation, test = parts
+    return Task("cube_slides", LINE, dt, train, validation, test, given=given, judged_by=("one_step", "stops"))
 
 
 def _read(path: Path) -> tuple[list[NDArray], dict[str, float]]:
@@ -92,11 +94,9 @@ def _recordings(slides: list[NDArray]) -> Recordings:
     padded = torch.from_numpy(
         np.stack([np.pad(slide, ((0, instants - len(slide)), (0, 0)), mode="edge") for slide in slides])
     ).to(torch.float64)
+    columns = [COLUMNS.index("s_m"), COLUMNS.index("v_m_s")]
     return Recordings(
-        positions=padded[..., COLUMNS.index("s_m")].contiguous(),
-        velocities=padded[..., COLUMNS.index("v_m_s")].contiguous(),
-        forces=torch.zeros(len(slides), instants - 1, dtype=torch.float64),
-        friction=None,
+        states=padded[..., columns].contiguous(),
+        drive=Drive(torch.zeros(len(slides), instants - 1, 1, dtype=torch.float64)),
         steps=torch.tensor([len(slide) - 1 for slide in slides]),
-        true_velocities=None,
     )

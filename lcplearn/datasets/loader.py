@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from lcplearn.formulations.losses import Windows
+from lcplearn.datasets.recordings import Windows
 
 
 class WindowLoader:
@@ -36,7 +36,7 @@ class WindowLoader:
         rank: int | None = None,
         world_size: int | None = None,
     ) -> None:
-        if windows.velocity.shape[0] == 0:
+        if windows.valid.shape[0] == 0:
             raise ValueError("windows: expected at least one window, got none")
         if batch_size is not None and batch_size < 1:
             raise ValueError(f"batch_size: expected at least 1, got {batch_size}")
@@ -68,14 +68,8 @@ class WindowLoader:
 
     def __iter__(self) -> Iterator[Windows]:
         shard = self._shard()
-        velocity, force, friction, valid = self.windows
         for indices in shard.split(self.batch_size or len(shard)):
-            yield Windows(
-                velocity=velocity[indices],
-                force=force[indices],
-                friction=None if friction is None else friction[indices],
-                valid=valid[indices],
-            )
+            yield self.windows.map(lambda values, chosen=indices: values[chosen])  # type: ignore[misc]  # mypy 17335
 
     def _ranks(self) -> tuple[int, int]:
         # Asked for at each epoch: Lightning starts the process group after the loader is built.
@@ -85,10 +79,10 @@ class WindowLoader:
         return (torch.distributed.get_rank(), torch.distributed.get_world_size()) if distributed else (0, 1)
 
     def _shard_size(self) -> int:
-        return math.ceil(self.windows.velocity.shape[0] / self._ranks()[1])
+        return math.ceil(self.windows.valid.shape[0] / self._ranks()[1])
 
     def _shard(self) -> Tensor:
-        count = self.windows.velocity.shape[0]
+        count = self.windows.valid.shape[0]
         rank, world_size = self._ranks()
         if self.shuffle:
             generator = torch.Generator().manual_seed(self.seed + 1_000_003 * self.epoch)  # distinct for seeds < 1e6
@@ -96,4 +90,4 @@ class WindowLoader:
         else:
             order = torch.arange(count)
         wrapped = torch.arange(rank, self._shard_size() * world_size, world_size) % count
-        return order[wrapped].to(self.windows.velocity.device)
+        return order[wrapped].to(self.windows.valid.device)

@@ -1,14 +1,18 @@
 """Simulated recordings: nothing to download, and the truth is known."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lcplearn.datasets.recordings import BlockData, Recordings
+from lcplearn.datasets.recordings import Recordings
+from lcplearn.datasets.task import Task
+from lcplearn.domains import NOT_NEGATIVE, SHARE, check
 from lcplearn.scenes.falling_block import FallingBlock
+from lcplearn.scenes.scene import Drive
 from lcplearn.scenes.sliding_block import SlidingBlock
+from lcplearn.scenes.space import LINE
 
 FrictionLabels = Literal["physical", "lcp", "slack", "measured_slack"]
 
@@ -46,7 +50,7 @@ def simulate_sliding_block(
     initial_speed: float = 1.0,
     share_from_rest: float = 0.5,
     share_at_rest: float | None = None,
-) -> BlockData:
+) -> Task:
     """Record a block pushed to and fro on a table with dry friction.
 
     v_{k+1} = S(v_k + u_{k+1} dt/m, mu g dt), measured with noise N(0, noise^2).
@@ -86,11 +90,7 @@ def simulate_sliding_block(
     sizes = [(trajectories, length), (validation_trajectories, length)]
     sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
     _check_sizes(sizes, noise)
-    for name, share in (("switch_probability", switch_probability), ("share_from_rest", share_from_rest)):
-        if not 0 <= share <= 1:
-            raise ValueError(f"{name}: expected between 0 and 1, got {share}")
-    if not mu >= 0:
-        raise ValueError(f"mu: expected at least 0, got {mu}")
+    check(SHARE, switch_probability=switch_probability, share_from_rest=share_from_rest)
     if friction is not None and friction not in get_args(FrictionLabels):
         raise ValueError(f"friction: expected one of {', '.join(get_args(FrictionLabels))}, got {friction!r}")
     block = SlidingBlock(mass=mass, mu=mu, dt=dt, gravity=gravity)
@@ -100,21 +100,24 @@ def simulate_sliding_block(
         moving = torch.arange(count) >= round(share_from_rest * count)
         draws.append(draw._replace(start=draw.start * initial_speed * moving))
     force_std = _force_std(block, draws[0], force_std, share_at_rest)
-    recordings = {}
+    recordings: dict[str, Any] = {}
     for name, draw in zip(_SPLITS, draws, strict=True):
         forces = force_std * draw.force
         velocities = _slide(block, draw.start, forces)
         measured = velocities + (noise if name in ("train", "validation") else 0.0) * draw.noise
         moved = torch.nn.functional.pad(dt * velocities[:, 1:].cumsum(dim=1), (1, 0))
         labels = None if friction is None else friction_labels(block, velocities[:, :-1], forces, friction)
-        recordings[name] = Recordings(moved, measured, forces, labels, _full_length(forces), velocities)
-    return BlockData(kind="sliding_block", **recordings, dt=dt, gravity=gravity, mass=mass, mu=mu)
+        drive = Drive(forces.unsqueeze(-1), labels)
+        true = torch.stack((moved, velocities), dim=-1)
+        recordings[name] = Recordings(torch.stack((moved, measured), dim=-1), drive, _full_length(forces), true)
+    given, truth = {"gravity": gravity}, {"mu": mu, "mass": mass}
+    return Task("sliding_block", LINE, dt, **recordings, given=given, truth=truth, scene=block)
 
 
 def friction_labels(
     block: SlidingBlock, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"], kind: FrictionLabels
 ) -> Float[Tensor, "... 2"]:
-    """Friction of a step in the pairs that the notes' learning problems take as known.
+    """Friction of a step in the pairs that a learning problem may take as known.
 
     With F the physical friction force on the block and lambda-', lambda+' the slacks of the direct LCP:
 
@@ -123,8 +126,8 @@ def friction_labels(
     slack:           (lambda-', lambda+')
     measured_slack:  (mu m g - max(-F, 0), mu m g - max(F, 0))
 
-    lcp fits the affine law of 3.1.1 and slack that of 3.1.2; physical and measured_slack are what could be measured,
-    and fit neither.
+    lcp fits the affine law of `Direct` and slack that of `Slack`; physical and measured_slack are what could be
+    measured, and fit neither.
 
     Args:
         block: The block.
@@ -135,7 +138,7 @@ def friction_labels(
     Returns:
         The pair [N].
 
-    Source: LCP Notes 3.1.1, 3.1.2; errata 16 and 20.
+    Source: NOTES 6.
     """
     limit = block.mu * block.mass * block.gravity
     if kind in ("lcp", "slack"):
@@ -163,7 +166,7 @@ def simulate_falling_block(
     noise: float = 0.0,
     initial_height: float = 1.0,
     initial_speed: float = 1.0,
-) -> BlockData:
+) -> Task:
     """Record a block dropped onto the ground, where it stays.
 
     The start is drawn from N(0, initial_speed^2) for the velocity and uniformly up to initial_height for the gap; no
@@ -186,7 +189,7 @@ def simulate_falling_block(
         initial_speed: Standard deviation of the velocity at the start [m/s].
 
     Returns:
-        The recordings and the truth; positions are gaps, mu is None.
+        The recordings and the truth; positions are gaps.
 
     Raises:
         ValueError: An argument is out of range.
@@ -195,19 +198,20 @@ def simulate_falling_block(
     sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
     _check_sizes(sizes, noise)
     block = FallingBlock(mass=mass, dt=dt, gravity=gravity)
-    recordings = {}
+    recordings: dict[str, Any] = {}
     for split, (name, (count, steps)) in enumerate(zip(_SPLITS, sizes, strict=True)):
         generator = _generator(seed, split)
         height = initial_height * torch.rand(count, generator=generator, dtype=torch.float64)
         speed = initial_speed * torch.randn(count, generator=generator, dtype=torch.float64)
-        forces = torch.zeros(count, steps, dtype=torch.float64)
-        path = block.rollout(torch.stack((height, speed), dim=-1), forces.unsqueeze(-1))
-        velocities = path.velocities.squeeze(-1)
-        error = torch.randn(velocities.shape, generator=generator, dtype=torch.float64)
-        measured = velocities + (noise if name in ("train", "validation") else 0.0) * error
-        gaps = path.positions.squeeze(-1)
-        recordings[name] = Recordings(gaps, measured, forces, None, _full_length(forces), velocities)
-    return BlockData(kind="falling_block", **recordings, dt=dt, gravity=gravity, mass=mass, mu=None)
+        drive = Drive(torch.zeros(count, steps, 1, dtype=torch.float64))
+        path = block.rollout(torch.stack((height, speed), dim=-1), drive.force)
+        error = torch.randn(path.velocities.shape[:-1], generator=generator, dtype=torch.float64).unsqueeze(-1)
+        measured = path.velocities + (noise if name in ("train", "validation") else 0.0) * error
+        true = torch.cat((path.positions, path.velocities), dim=-1)
+        states = torch.cat((path.positions, measured), dim=-1)
+        recordings[name] = Recordings(states, drive, _full_length(drive.force), true)
+    given = {"gravity": gravity}
+    return Task("falling_block", LINE, dt, **recordings, given=given, truth={"mass": mass}, scene=block)
 
 
 def _generator(seed: int, split: int) -> Generator:
@@ -257,8 +261,7 @@ def _check_sizes(sizes: list[tuple[int, int]], noise: float) -> None:
     for name, (count, steps) in zip(_SPLITS, sizes, strict=True):
         if count < 1 or steps < 1:
             raise ValueError(f"{name}: expected at least 1 trajectory of 1 step, got {count} of {steps}")
-    if not noise >= 0:
-        raise ValueError(f"noise: expected at least 0, got {noise}")
+    check(NOT_NEGATIVE, noise=noise)
 
 
 def _full_length(forces: Tensor) -> Tensor:

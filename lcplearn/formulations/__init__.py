@@ -1,13 +1,16 @@
 """What is learned: torch modules behind one interface, `Formulation`, and the losses that train them."""
 
-from lcplearn.formulations.baselines import MLP, Affine, ForceMLP
-from lcplearn.formulations.direct import Direct
-from lcplearn.formulations.formulation import Formulation
-from lcplearn.formulations.losses import LOSS_TERMS, Windows, loss_terms
-from lcplearn.formulations.relu import ReLU
-from lcplearn.formulations.slack import Slack
-from lcplearn.formulations.structured import Physical, Structured
-from lcplearn.formulations.traditional import PSD, PSDSkew, Traditional
+from lcplearn.formulations.baselines import MLP, Affine
+from lcplearn.formulations.formulation import Formulation, build
+from lcplearn.formulations.identified import Identified, Physical
+from lcplearn.formulations.line.direct import Direct
+from lcplearn.formulations.line.force_mlp import ForceMLP
+from lcplearn.formulations.line.formulation import LineFormulation
+from lcplearn.formulations.line.relu import ReLU
+from lcplearn.formulations.line.slack import Slack
+from lcplearn.formulations.line.structured import Structured
+from lcplearn.formulations.line.traditional import PSD, PSDSkew, Traditional
+from lcplearn.formulations.losses import loss_terms
 
 FORMULATIONS: dict[str, type[Formulation]] = {
     "affine": Affine,
@@ -25,19 +28,20 @@ FORMULATIONS: dict[str, type[Formulation]] = {
 
 __all__ = [
     "FORMULATIONS",
-    "LOSS_TERMS",
     "MLP",
     "PSD",
     "Affine",
     "Direct",
     "ForceMLP",
     "Formulation",
+    "Identified",
+    "LineFormulation",
     "PSDSkew",
     "Physical",
     "ReLU",
     "Slack",
     "Structured",
     "Traditional",
-    "Windows",
+    "build",
     "loss_terms",
 ]

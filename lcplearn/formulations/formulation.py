@@ -1,115 +1,155 @@
-"""The one interface of all learned models: (velocity, force) -> velocity after one time step."""
+"""The one interface of all learned models: they advance a state under a drive, as scenes do."""
 
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lcplearn.formulations.networks import positive
-from lcplearn.lcp.solution import LCPSolution
-from lcplearn.lcp.solve import solve_lcp
-from lcplearn.scenes.rollout import Mode, Trajectory, rollout
-
-STICK_SPEED = 1e-12  # [m/s] below it a block rests: exact zeros pass, values that a fit only drives towards zero do not
+from lcplearn.datasets.recordings import Windows
+from lcplearn.datasets.task import Task
+from lcplearn.domains import positive
+from lcplearn.scenes.scene import Drive, Scene, Step, Trajectory, rollout
+from lcplearn.scenes.space import Space
 
 
 class Formulation(nn.Module):
-    """Predict the velocity of a block after one time step.
+    """Predict the state of what moves after one time step.
 
-    Subclasses implement `next_velocity`; position, rollouts and modes follow from it. The position is advanced with
-    the new velocity (implicit Euler, as in the notes): x_{k+1} = x_k + dt v_{k+1}.
+    Subclasses implement `advance`; rollouts and loss terms follow from it. Constructors take keyword arguments only.
 
     Attributes:
+        space: What a state is.
+        contacts: Number of contacts whose mode a step tells.
         dt: Time step [s].
-        gravity: Acceleration of gravity [m/s^2].
+        radius: What weighs rotations against translations in losses and figures [m].
+        given: Numbers taken as known, by name; data must agree with them.
         needs_friction: True if a prediction needs measured friction.
-        last_solution: The last LCP solved in a forward pass, detached; None if there was none.
+        temperature: Softening of a threshold in training [m/s], see `softened`; 0 in predictions. An attribute and no
+            argument: it would go through every signature between the loss and the threshold for two models' sake.
         arguments: Constructor arguments as they were given: with the class, what a checkpoint needs to rebuild it.
     """
 
     needs_friction: ClassVar[bool] = False
-    last_solution: LCPSolution | None
+    space: Space
+    contacts: int = 1
+    radius: float = 1.0
+    given: Mapping[str, Any]
+    temperature: float = 0.0
     arguments: dict[str, Any]
 
-    def __new__(cls, **arguments: Any) -> "Formulation":
+    def __new__(cls, *wrong: Any, **arguments: Any) -> "Formulation":
+        if wrong:
+            raise TypeError(f"{cls.__name__}: expected keyword arguments only, got {wrong[0]!r} without a name")
         model = super().__new__(cls)
         model.__dict__["arguments"] = arguments  # nn.Module's own __setattr__ works only after its __init__
         return model
 
-    def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
+    def __init__(self, *, space: Space, dt: float, given: Mapping[str, Any] | None = None) -> None:
         super().__init__()
-        self.dt = positive("dt", dt)
-        self.gravity = positive("gravity", gravity)
-        self.last_solution = None
+        self.space, self.dt, self.given = space, positive("dt", dt), dict(given or {})
 
-    def next_velocity(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
-        """Predict the velocity one step later.
+    def advance(self, state: Float[Tensor, "*batch nq_plus_nv"], drive: Drive) -> Step:
+        """Predict the state one step later.
 
         Args:
-            velocity: Velocity now [m/s].
-            force: Force applied during the step [N].
-            friction: Measured friction during the step [N], of the kind that the model was trained with; read by
+            state: Positions, then velocities.
+            drive: Force during the step; measured friction, of the kind that the model was trained with, is read by
                 models with `needs_friction` only.
 
-        Returns:
-            Velocity after the step [m/s].
+        Raises:
+            ValueError: friction is needed and missing.
         """
         raise NotImplementedError
 
+    def moving(self) -> Scene:
+        """What a rollout advances: the model, or a scene with the learned numbers, made once for all steps."""
+        return self
+
     def step(
         self,
-        state: Float[Tensor, "*batch 2"],
-        force: Float[Tensor, "*batch 1"],
+        state: Float[Tensor, "*batch nq_plus_nv"],
+        force: Float[Tensor, "*batch nv"],
         friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch 2"]:
-        """Advance position [m] and velocity [m/s] by one step under a force [N], in float64 as all parameters are."""
-        position, velocity = state.double().unbind(-1)
-        velocity = self.next_velocity(velocity, force[..., 0].double(), None if friction is None else friction.double())
-        return torch.stack((position + self.dt * velocity, velocity), dim=-1)
+    ) -> Float[Tensor, "*batch nq_plus_nv"]:
+        """Advance a state by one step under a force [N], in float64 as all parameters are."""
+        return self.advance(state.double(), Drive(force, friction).map(Tensor.double)).state
 
     def rollout(
         self,
-        state: Float[Tensor, "*batch 2"],
-        forces: Float[Tensor, "*batch T 1"],
+        state: Float[Tensor, "*batch nq_plus_nv"],
+        forces: Float[Tensor, "*batch T nv"],
         friction: Float[Tensor, "*batch T 2"] | None = None,
     ) -> Trajectory:
         """Predict a trajectory from an initial state and the forces of T steps.
 
         Args:
-            state: Position [m] and velocity [m/s] at the start.
+            state: Positions, then velocities, at the start.
             forces: Force during each step [N].
             friction: Measured friction during each step [N]; models with `needs_friction` only.
 
         Returns:
-            Positions, velocities and the mode of each step: stick where the new velocity is below 1e-12 m/s.
+            Positions, velocities and the contact modes of each step.
         """
-        measured = None if friction is None else iter(friction.unbind(-2))  # `rollout` takes the steps in order
+        return rollout(self.moving(), state.double(), Drive(forces, friction).map(Tensor.double))
 
-        def step(state: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            after = self.step(state, force, None if measured is None else next(measured))
-            rests = after[..., 1:].abs() < STICK_SPEED
-            return after, torch.where(rests, int(Mode.STICK), int(Mode.SLIP))
+    def errors(self) -> dict[str, Callable[[Windows], Tensor]]:
+        """Loss terms that the model has: functions of windows that give a value for each first step, or each step."""
+        return {"prediction": self.prediction_error, "rollout": self.rollout_error}
 
-        return rollout(step, state, forces)
+    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        """Squared error of the velocity after the first step of each window [m^2/s^2]."""
+        after = self.advance(windows.states[:, 0], windows.drive.at(0)).state
+        return self.velocity_error(after, windows.states[:, 1])
+
+    def rollout_error(self, windows: Windows) -> Float[Tensor, "B k"]:
+        """Squared error of the velocity after each step, predicted from the window's first state [m^2/s^2]."""
+        scene, state, predicted = self.moving(), windows.states[:, 0], []
+        for k in range(windows.valid.shape[1]):
+            state = scene.advance(state, windows.drive.at(k)).state
+            predicted.append(state)
+        return self.velocity_error(torch.stack(predicted, dim=-2), windows.states[:, 1:])
+
+    def velocity_error(
+        self, predicted: Float[Tensor, "*batch nq_plus_nv"], measured: Float[Tensor, "*batch nq_plus_nv"]
+    ) -> Float[Tensor, "*batch"]:
+        """Squared distance of the velocities of two states [m^2/s^2], rotations weighted by `radius`."""
+        difference = predicted[..., self.space.nq :] - measured[..., self.space.nq :]
+        return self.space.squared_speed(difference, self.radius)
 
     def physical_parameters(self) -> dict[str, float]:
-        """Friction coefficient `mu` and `mass` [kg] where the model determines them, else nothing."""
+        """Learned numbers with a physical meaning, such as `mu` and `mass` [kg], where the model determines them."""
         return {}
 
-    def solve(
-        self, M: Float[Tensor, "*#batch n n"], q: Float[Tensor, "*#batch n"], method: str = "auto"
-    ) -> LCPSolution:
-        """Solve the model's LCP and keep the detached solution as `last_solution` for reports."""
-        solution = solve_lcp(M, q, method=method)
-        self.last_solution = LCPSolution(*(_detached(field) for field in solution))
-        return solution
+    @contextmanager
+    def softened(self, temperature: float) -> Iterator[None]:
+        """Within, thresholds have this temperature [m/s]; whoever predicts or validates sees the exact ones."""
+        self.temperature = temperature
+        try:
+            yield
+        finally:
+            self.temperature = 0.0
 
 
-def _detached(field: Any) -> Any:
-    return field.detach() if isinstance(field, Tensor) else field
+FROM_TASK = ("space", "dt", "given", "gravity")  # constructor arguments that a task has
+
+
+def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
+    """Build a model for a task: its space, dt and what is given come from the task, as far as the model asks for them.
+
+    Args:
+        cls: Class of the model.
+        task: What is to be learned.
+        arguments: The other constructor arguments.
+    """
+    known: dict[str, Any] = {
+        "gravity": task.given.get("gravity"),
+        "space": task.space,
+        "dt": task.dt,
+        "given": dict(task.given),
+    }
+    asked = inspect.signature(cls.__init__).parameters
+    return cls(**{name: known[name] for name in FROM_TASK if name in asked and known[name] is not None} | arguments)

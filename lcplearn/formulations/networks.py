@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lcplearn.domains import positive
+
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
 
@@ -31,9 +33,9 @@ def network(inputs: int, outputs: int, *, width: int, depth: int, activation: st
         ValueError: width below one, negative depth, or an unknown activation.
     """
     if width < 1 or depth < 0:
-        raise ValueError(f"width must be at least 1 and depth at least 0, got width={width}, depth={depth}.")
+        raise ValueError(f"width, depth: expected at least 1 and at least 0, got {width} and {depth}")
     if activation not in ACTIVATIONS:
-        raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {activation!r}.")
+        raise ValueError(f"activation: expected one of {', '.join(ACTIVATIONS)}, got {activation!r}")
     layers: list[nn.Module] = []
     for _ in range(depth):
         layers += [nn.Linear(inputs, width, dtype=torch.float64), ACTIVATIONS[activation]()]
@@ -44,10 +46,3 @@ def network(inputs: int, outputs: int, *, width: int, depth: int, activation: st
 def log_parameter(name: str, value: float) -> nn.Parameter:
     """Logarithm of a positive quantity as a parameter, so that training can't make the quantity negative."""
     return nn.Parameter(torch.tensor(positive(name, value), dtype=torch.float64).log())
-
-
-def positive(name: str, value: float) -> float:
-    """Return `value` if it is positive and finite, else raise a ValueError that names it."""
-    if not 0.0 < value < float("inf"):
-        raise ValueError(f"{name} must be positive and finite, got {value}.")
-    return float(value)

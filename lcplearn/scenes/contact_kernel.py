@@ -348,7 +348,7 @@ def _workspace(C, nv, T):
 
 @_jit
 def _members(active, index):
-    """Number of active contacts; their numbers go to index. (A function, so that numba takes no count for a literal.)"""
+    """Number of active contacts; their numbers go to index. (A function: numba would take a count for a literal.)"""
     count = 0
     for i in range(active.size):
         if active[i]:

@@ -1,18 +1,21 @@
-"""A block that falls onto the ground: LCP Notes 1, and restitution as the errata have it."""
+"""A block that falls onto the ground, without and with restitution."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lcplearn.domains import POSITIVE, REAL, SHARE, Domain, check
 from lcplearn.lcp.solve import solve_lcp
-from lcplearn.scenes.checks import require_positive
-from lcplearn.scenes.rollout import Block, Mode
+from lcplearn.scenes.scene import Drive, Mode, Moving, Step
+from lcplearn.scenes.space import LINE, Space
 
 
 @dataclass(frozen=True)
-class FallingBlock(Block):
+class FallingBlock(Moving):
     """A block that falls, lands without penetrating and stays.
 
     0 <= x_{k+1} ⟂ lambda = (m/dt^2) x_{k+1} - (m/dt^2) (x_k + dt v_k + dt^2 (u/m - g)) >= 0, one row.
@@ -25,15 +28,19 @@ class FallingBlock(Block):
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2]. Number or tensor that broadcasts over the batch.
 
-    Source: LCP Notes 1; errata 1; NOTES 5.1. Differs: 1. general mass and an external force.
+    Source: Pfrommer's "LCP Notes" (2019), section 1, with general mass and an external force; NOTES 5.1.
     """
+
+    space: ClassVar[Space] = LINE
+    contacts: ClassVar[int] = 1
+    numbers: ClassVar[Mapping[str, Domain]] = {"mass": POSITIVE, "gravity": REAL}
 
     mass: float | Tensor
     dt: float
     gravity: float | Tensor = 9.81
 
     def __post_init__(self) -> None:
-        require_positive(mass=self.mass, dt=self.dt)
+        check(POSITIVE, mass=self.mass, dt=self.dt)
 
     def lcp(
         self, gap: Float[Tensor, "*#batch"], velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
@@ -58,23 +65,23 @@ class FallingBlock(Block):
         """Next gap max(x_k + dt v_k + dt^2 (u/m - g), 0) [m]."""
         return torch.relu(gap + self.dt * self._free_velocity(velocity, force))
 
-    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
-        """Next state [*batch, 2] and contact mode [*batch, 1]: SEPARATION, or STICK while the gap is 0."""
+    def advance(self, state: Float[Tensor, "*#batch 2"], drive: Drive) -> Step:
+        """Next gap and velocity, and contact mode: SEPARATION, or STICK while the gap is 0."""
         gap, velocity = state.unbind(-1)
-        next_gap = solve_lcp(*self.lcp(gap, velocity, force[..., 0]), method="diagonal").z[..., 0]
+        force = drive.force[..., 0]
+        solution = solve_lcp(*self.lcp(gap, velocity, force), method="diagonal")
+        next_gap = solution.z[..., 0]
         # (x_{k+1} - x_k) / dt, written so that rest is exactly 0 and free flight has no cancellation
-        next_velocity = torch.where(
-            next_gap > 0, self._free_velocity(velocity, force[..., 0]), (next_gap - gap) / self.dt
-        )
+        next_velocity = torch.where(next_gap > 0, self._free_velocity(velocity, force), (next_gap - gap) / self.dt)
         mode = torch.where(next_gap > 0, int(Mode.SEPARATION), int(Mode.STICK))
-        return torch.stack((next_gap, next_velocity), dim=-1), mode.unsqueeze(-1)
+        return Step(torch.stack((next_gap, next_velocity), dim=-1), mode.unsqueeze(-1), solution, solution.solved)
 
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + self.dt * (force / self.mass - self.gravity)
 
 
 @dataclass(frozen=True)
-class BouncingBlock(Block):
+class BouncingBlock(Moving):
     """A block that falls and bounces off the ground.
 
     0 <= v_{k+1} + e v_k ⟂ lambda = (m/dt) (v_{k+1} - v_k) - u + m g >= 0 where x_k + dt v_k <= 0, else lambda = 0.
@@ -91,15 +98,18 @@ class BouncingBlock(Block):
     Source: NOTES 5.2; Moreau 1988.
     """
 
+    space: ClassVar[Space] = LINE
+    contacts: ClassVar[int] = 1
+    numbers: ClassVar[Mapping[str, Domain]] = {"mass": POSITIVE, "restitution": SHARE, "gravity": REAL}
+
     mass: float | Tensor
     restitution: float | Tensor
     dt: float
     gravity: float | Tensor = 9.81
 
     def __post_init__(self) -> None:
-        require_positive(mass=self.mass, dt=self.dt)
-        if not isinstance(self.restitution, Tensor) and not 0 <= self.restitution <= 1:
-            raise ValueError(f"restitution: expected a number from 0 to 1, got {self.restitution}")
+        check(POSITIVE, mass=self.mass, dt=self.dt)
+        check(SHARE, restitution=self.restitution)
 
     def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step in contact: M [*#batch, 1, 1], q [*batch, 1], from velocity [m/s] and force [N]."""
@@ -107,16 +117,17 @@ class BouncingBlock(Block):
         excess = self._free_velocity(velocity, force) + self.restitution * velocity
         return _one_row(inertia, excess), -(inertia * excess).unsqueeze(-1)
 
-    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
-        """Next state [*batch, 2] and contact mode [*batch, 1]: SEPARATION, or STICK while the ground pushes."""
+    def advance(self, state: Float[Tensor, "*#batch 2"], drive: Drive) -> Step:
+        """Next gap and velocity, and contact mode: SEPARATION, or STICK while the ground pushes."""
         gap, velocity = state.unbind(-1)
-        solution = solve_lcp(*self.lcp(velocity, force[..., 0]), method="diagonal")
+        force = drive.force[..., 0]
+        solution = solve_lcp(*self.lcp(velocity, force), method="diagonal")
         in_contact = (gap + self.dt * velocity <= 0) & (solution.z[..., 0] == 0)
-        next_velocity = torch.where(
-            in_contact, 0.0 - self.restitution * velocity, self._free_velocity(velocity, force[..., 0])
-        )
+        free = self._free_velocity(velocity, force)
+        next_velocity = torch.where(in_contact, 0.0 - self.restitution * velocity, free)
         mode = torch.where(in_contact, int(Mode.STICK), int(Mode.SEPARATION))
-        return torch.stack((gap + self.dt * next_velocity, next_velocity), dim=-1), mode.unsqueeze(-1)
+        state = torch.stack((gap + self.dt * next_velocity, next_velocity), dim=-1)
+        return Step(state, mode.unsqueeze(-1), solution, solution.solved)
 
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + self.dt * (force / self.mass - self.gravity)

@@ -1,15 +1,16 @@
 """A point mass that slides on a table in two directions: friction in a disc."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check
 from lcplearn.lcp.solve import solve_lcp
-from lcplearn.scenes.checks import require_positive
 from lcplearn.scenes.contact import Contacts, contact_step
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Mode, Step
@@ -57,6 +58,8 @@ class PlanarBlock:
     Source: NOTES 5.7.
     """
 
+    numbers: ClassVar[Mapping[str, Domain]] = {"mass": POSITIVE, "mu": NOT_NEGATIVE, "gravity": POSITIVE}
+
     mass: Number | tuple[Number, Number]
     mu: Number
     dt: float
@@ -66,8 +69,8 @@ class PlanarBlock:
 
     def __post_init__(self) -> None:
         for mass in self.mass if isinstance(self.mass, tuple) else (self.mass,):
-            require_positive(mass=mass)
-        require_positive(dt=self.dt)
+            check(POSITIVE, mass=mass)
+        check(POSITIVE, dt=self.dt)
         if self.form not in ("exact", "facets", "traditional"):
             raise ValueError(f"form: expected 'exact', 'facets' or 'traditional', got {self.form!r}")
         if self.form != "exact" and (self.m < 3 or isinstance(self.mass, tuple)):

@@ -1,12 +1,14 @@
 """A polygon in its vertical plane, tossed onto or sliding on level ground; and one that stands on another."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.scenes.checks import require_positive
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
 from lcplearn.scenes.contact import Contacts, ContactStep, RestitutionLaw, closing_speed, contact_step, rebound
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Step
@@ -36,6 +38,13 @@ class PlanarBody:
     Source: Stewart and Trinkle 1996.
     """
 
+    numbers: ClassVar[Mapping[str, Domain]] = {
+        **dict.fromkeys(("mass", "inertia"), POSITIVE),
+        **dict.fromkeys(("mu", "compliance"), NOT_NEGATIVE),
+        **dict.fromkeys(("corners", "ground", "gravity"), REAL),
+        "restitution": SHARE,
+    }
+
     corners: Tensor
     inertia: Number
     mu: Number
@@ -49,7 +58,7 @@ class PlanarBody:
     rest: bool = True
 
     def __post_init__(self) -> None:
-        require_positive(mass=self.mass, dt=self.dt, inertia=self.inertia)
+        check(POSITIVE, mass=self.mass, dt=self.dt, inertia=self.inertia)
         if self.corners.ndim < 2 or self.corners.shape[-1] != 2:
             raise ValueError(f"corners: expected shape [*batch, C, 2], got {list(self.corners.shape)}")
 
@@ -121,9 +130,9 @@ class PlanarStack:
     rest: bool = True
 
     def __post_init__(self) -> None:
-        require_positive(dt=self.dt, lower=min(self.lower), upper=min(self.upper))
+        check(POSITIVE, dt=self.dt, lower=min(self.lower), upper=min(self.upper))
         for mass in self.masses:
-            require_positive(masses=mass)
+            check(POSITIVE, masses=mass)
 
     @property
     def space(self) -> Space:

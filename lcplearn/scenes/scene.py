@@ -1,5 +1,6 @@
 """What all that moves can do: advance a state by one step under a drive; and rollouts, step after step."""
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -9,6 +10,8 @@ from torch import Tensor
 
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.scenes.space import Space
+
+STICK_SPEED = 1e-12  # [m/s] below it a body rests: exact zeros pass, values that a fit only drives towards zero do not
 
 
 class Mode(IntEnum):
@@ -32,7 +35,11 @@ class Drive(NamedTuple):
 
     def at(self, k: int) -> "Drive":
         """Drive of step k, of a drive over T steps."""
-        return Drive(self.force[..., k, :], None if self.friction is None else self.friction[..., k, :])
+        return self.map(lambda values: values[..., k, :])
+
+    def map(self, f: Callable[[Tensor], Tensor]) -> "Drive":
+        """Apply a function to all that acts."""
+        return Drive(f(self.force), None if self.friction is None else f(self.friction))
 
 
 class Step(NamedTuple):
@@ -71,6 +78,11 @@ class Trajectory(NamedTuple):
 class Scene(Protocol):
     """A scene or a learned model: whoever has these can be rolled out, scored, drawn and compared.
 
+    A scene may have more, which is used where it is there: `numbers`, a mapping from the names of its constructor's
+    numbers to their `Domain` (`Identified` learns them); `violation(state, drive, after)`, how badly the best contact
+    force explains a measured step [m^2/s^2], [*batch] (a loss); a constructor argument `temperature`, which softens
+    its thresholds in training; `radius` [m], which weighs rotations against translations.
+
     Attributes:
         space: What a state is.
         contacts: Number of contacts whose mode a step tells.
@@ -89,6 +101,20 @@ class Scene(Protocol):
     def advance(self, state: Tensor, drive: Drive) -> Step:
         """Advance a state [*batch, nq + nv] by one step of dt."""
         ...
+
+
+class Moving:
+    """Step and rollout under forces alone, for classes with `advance`."""
+
+    def step(self: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], force: Float[Tensor, "*#batch nv"]) -> Tensor:
+        """Next state under a force [N]."""
+        return self.advance(state, Drive(force)).state
+
+    def rollout(
+        self: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], forces: Float[Tensor, "*#batch T nv"]
+    ) -> Trajectory:
+        """Trajectory over T forces [N] from a state."""
+        return rollout(self, state, Drive(forces))
 
 
 def rollout(scene: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], drive: Drive) -> Trajectory:

@@ -1,17 +1,23 @@
-"""A block that slides on a table with dry friction: LCP Notes 2.1, 2.2 and 2.5 with the errata."""
+"""A block that slides on a table with dry friction."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import softplus
 
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check
+from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
-from lcplearn.scenes.checks import require_positive
-from lcplearn.scenes.rollout import Block, Mode
+from lcplearn.scenes.scene import Drive, Mode, Moving, Step
+from lcplearn.scenes.space import LINE, Space
+from lcplearn.scenes.violation import violation
 
 Form = Literal["direct", "physical", "traditional"]
+NUMBERS = {"mass": POSITIVE, "mu": NOT_NEGATIVE, "gravity": POSITIVE}
 
 
 def slide(p: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "..."]:
@@ -34,7 +40,7 @@ def slide(p: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"] | float) -> F
 
 
 @dataclass(frozen=True)
-class OneWayBlock(Block):
+class OneWayBlock(Moving):
     """A block that friction can stop but nothing can push back.
 
     0 <= v_{k+1} ⟂ lambda' = (m/dt) v_{k+1} - (m/dt) v_k - u + mu m g >= 0, one row.
@@ -48,8 +54,12 @@ class OneWayBlock(Block):
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2].
 
-    Source: LCP Notes 2.1, Remark 1; errata 2-4. Differs: 1. general mass, forces in newtons.
+    Source: Pfrommer's "LCP Notes" (2019), section 2.1, with general mass and forces in newtons; NOTES 5.3.
     """
+
+    space: ClassVar[Space] = LINE
+    contacts: ClassVar[int] = 1
+    numbers: ClassVar[Mapping[str, Domain]] = NUMBERS
 
     mass: float | Tensor
     mu: float | Tensor
@@ -57,7 +67,8 @@ class OneWayBlock(Block):
     gravity: float = 9.81
 
     def __post_init__(self) -> None:
-        require_positive(mass=self.mass, dt=self.dt)
+        check(POSITIVE, mass=self.mass, dt=self.dt)
+        check(NOT_NEGATIVE, mu=self.mu)
 
     def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step.
@@ -81,15 +92,20 @@ class OneWayBlock(Block):
         self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "..."]:
         """Next velocity [m/s], from the LCP."""
-        return solve_lcp(*self.lcp(velocity, force), method="diagonal").z[..., 0]
+        return self._solve(velocity, force).z[..., 0]
 
-    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
-        """Next state [*batch, 2] and contact mode [*batch, 1]."""
-        return _advance(state, self.next_velocity(state[..., 1], force[..., 0]), self.dt)
+    def advance(self, state: Float[Tensor, "*#batch 2"], drive: Drive) -> Step:
+        """Next position and velocity, and contact mode: STICK or SLIP."""
+        position, velocity = state.unbind(-1)
+        solution = self._solve(velocity, drive.force[..., 0])
+        return move(position, solution.z[..., 0], solution, self.dt)
+
+    def _solve(self, velocity: Tensor, force: Tensor) -> LCPSolution:
+        return solve_lcp(*self.lcp(velocity, force), method="diagonal")
 
 
 @dataclass(frozen=True)
-class SlidingBlock(Block):
+class SlidingBlock(Moving):
     """A block that slides both ways under dry friction and sticks exactly.
 
     v_{k+1} = S(p, c) with p = v_k + u dt/m and c = mu g dt, from one of three LCPs:
@@ -108,23 +124,33 @@ class SlidingBlock(Block):
 
     Attributes:
         mass: Mass [kg]; > 0. Number or tensor that broadcasts over the batch, like mu.
-        mu: Friction coefficient; >= 0. (A negative one makes the direct form's v+ and v- both positive.)
+        mu: Friction coefficient; >= 0. (A negative one would make the direct form's v+ and v- both positive.)
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2].
         form: Which LCP.
 
-    Source: LCP Notes 2.2 (direct), 2.5 (traditional); errata 5-15 and 22-24. Differs: 1. general mass and dt, forces in
-    newtons; 2. physical is the form that errata 15 puts in place of the direct one.
+        temperature: Softening T of the threshold [m/s]; at 0 the LCP is solved. Above 0, T softplus((+-p - c) / T)
+            replaces (v+, v-): its gradient with respect to mu is nowhere zero, so that training may start with it where
+            no sample is predicted to slip, and anneal it to 0.
+
+    Source: Pfrommer's "LCP Notes" (2019), sections 2.2 (direct) and 2.5 (traditional), with general mass and dt and
+    forces in newtons; NOTES 5.4 to 5.6.
     """
+
+    space: ClassVar[Space] = LINE
+    contacts: ClassVar[int] = 1
+    numbers: ClassVar[Mapping[str, Domain]] = NUMBERS
 
     mass: float | Tensor
     mu: float | Tensor
     dt: float
-    gravity: float = 9.81
+    gravity: float | Tensor = 9.81
     form: Form = "direct"
+    temperature: float = 0.0
 
     def __post_init__(self) -> None:
-        require_positive(mass=self.mass, dt=self.dt)
+        check(POSITIVE, mass=self.mass, dt=self.dt)
+        check(NOT_NEGATIVE, mu=self.mu)
         if self.form not in ("direct", "physical", "traditional"):
             raise ValueError(f"form: expected 'direct', 'physical' or 'traditional', got {self.form!r}")
 
@@ -158,27 +184,44 @@ class SlidingBlock(Block):
         self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "..."]:
         """Next velocity [m/s], from the LCP of this block's form."""
+        return self._solve(velocity, force)[0]
+
+    def advance(self, state: Float[Tensor, "*#batch 2"], drive: Drive) -> Step:
+        """Next position and velocity, and contact mode: STICK or SLIP."""
+        position, velocity = state.unbind(-1)
+        return move(position, *self._solve(velocity, drive.force[..., 0]), dt=self.dt)
+
+    def violation(
+        self, state: Float[Tensor, "*#batch 2"], drive: Drive, after: Float[Tensor, "*#batch 2"]
+    ) -> Float[Tensor, "..."]:
+        """How badly the best friction explains a measured step [m^2/s^2]; see `lcplearn.scenes.violation`."""
+        free = self._free_velocity(state[..., 1], drive.force[..., 0])
+        return violation(after[..., 1], after[..., 1] - free, self.mu * self.gravity * self.dt)
+
+    def _solve(self, velocity: Tensor, force: Tensor) -> tuple[Tensor, LCPSolution | None]:
+        if self.temperature > 0.0:
+            p = self._free_velocity(velocity, force)
+            excess = torch.stack((p, -p), dim=-1) - torch.as_tensor(self.mu * self.gravity * self.dt)[..., None]
+            parts = self.temperature * softplus(excess / self.temperature)
+            return parts[..., 0] - parts[..., 1], None
         M, q = self.lcp(velocity, force)
-        z = solve_lcp(M, q, method="diagonal" if self.form == "direct" else "auto").z
+        solution = solve_lcp(M, q, method="diagonal" if self.form == "direct" else "auto")
+        z = solution.z
         if self.form != "traditional":
-            return z[..., 0] - z[..., 1]
+            return z[..., 0] - z[..., 1], solution
         v = self._free_velocity(velocity, force) + self.dt / self.mass * (z[..., 0] - z[..., 1])
         gamma = z[..., 2]
-        return torch.minimum(torch.maximum(v, -gamma), gamma)
-
-    def advance(self, state: Float[Tensor, "*#batch 2"], force: Float[Tensor, "*#batch 1"]) -> tuple[Tensor, Tensor]:
-        """Next state [*batch, 2] and contact mode [*batch, 1]."""
-        return _advance(state, self.next_velocity(state[..., 1], force[..., 0]), self.dt)
+        return torch.minimum(torch.maximum(v, -gamma), gamma), solution
 
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + force * self.dt / self.mass
 
 
-def _advance(state: Tensor, next_velocity: Tensor, dt: float) -> tuple[Tensor, Int[Tensor, "... 1"]]:
-    """Implicit Euler for the position; the mode is SLIP where the block moves after the step."""
-    position = state[..., 0] + dt * next_velocity
-    mode = torch.where(next_velocity == 0, int(Mode.STICK), int(Mode.SLIP))
-    return torch.stack((position, next_velocity), dim=-1), mode.unsqueeze(-1)
+def move(position: Tensor, velocity: Tensor, solution: LCPSolution | None, dt: float) -> Step:
+    """Implicit Euler for the position from the velocity after the step; the mode is SLIP where that is not 0."""
+    mode = torch.where(velocity == 0, int(Mode.STICK), int(Mode.SLIP))
+    state = torch.stack((position + dt * velocity, velocity), dim=-1)
+    return Step(state, mode.unsqueeze(-1), solution, None if solution is None else solution.solved)
 
 
 def _matrix(factor: float | Tensor, pattern: list[list[float]], like: Tensor) -> Tensor:

@@ -47,6 +47,13 @@ class Space:
         """Number of velocities."""
         return len(self.velocities)
 
+    def origin(self) -> Float[Tensor, " nq_plus_nv"]:
+        """The state of rest at position 0, unturned."""
+        state = torch.zeros(self.nq + self.nv, dtype=torch.float64)
+        if self.nq > self.nv:
+            state[self.nq - 4] = 1.0
+        return state
+
     def split(self, state: Float[Tensor, "*batch nq_plus_nv"]) -> tuple[Tensor, Tensor]:
         """Positions [*batch, nq] and velocities [*batch, nv] of a state.
 
@@ -85,9 +92,17 @@ class Space:
 
     def speed(self, velocity: Float[Tensor, "*batch nv"], radius: float = 1.0) -> Float[Tensor, "*batch"]:
         """Size of a velocity [m/s], with angular velocities weighted by a radius [m]; its gradient at 0 is 0."""
+        return torch.linalg.vector_norm(self._weighted(velocity, radius), dim=-1)
+
+    def squared_speed(self, velocity: Float[Tensor, "*batch nv"], radius: float = 1.0) -> Float[Tensor, "*batch"]:
+        """Square of `speed` [m^2/s^2], what losses are made of."""
+        return self._weighted(velocity, radius).square().sum(-1)
+
+    def _weighted(self, velocity: Tensor, radius: float) -> Tensor:
+        if not self.rotations:
+            return velocity
         linear = self.nv - self.rotations
-        weighted = torch.cat((velocity[..., :linear], radius * velocity[..., linear:]), dim=-1)
-        return torch.linalg.vector_norm(weighted, dim=-1)
+        return torch.cat((velocity[..., :linear], radius * velocity[..., linear:]), dim=-1)
 
 
 LINE = Space(positions=("position_m",), velocities=("velocity_m_s",))

@@ -1,13 +1,15 @@
 """A convex body in space, tossed onto or sliding on level ground."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.scenes.checks import require_positive
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
 from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, contact_step, rebound
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Step
@@ -47,6 +49,13 @@ class SpatialBody:
     Source: Stewart and Trinkle 1996; NOTES 5.7.
     """
 
+    numbers: ClassVar[Mapping[str, Domain]] = {
+        **dict.fromkeys(("mass", "inertia"), POSITIVE),
+        **dict.fromkeys(("mu", "mu_impact", "radius", "compliance"), NOT_NEGATIVE),
+        **dict.fromkeys(("corners", "ground", "gravity"), REAL),
+        "restitution": SHARE,
+    }
+
     corners: Tensor
     inertia: Number | tuple[Number, Number, Number]
     mu: Number
@@ -64,9 +73,9 @@ class SpatialBody:
     rest: bool = True
 
     def __post_init__(self) -> None:
-        require_positive(mass=self.mass, dt=self.dt, impact_speed=self.impact_speed)
+        check(POSITIVE, mass=self.mass, dt=self.dt, impact_speed=self.impact_speed)
         for inertia in self.inertia if isinstance(self.inertia, tuple) else (self.inertia,):
-            require_positive(inertia=inertia)
+            check(POSITIVE, inertia=inertia)
         if self.corners.ndim < 2 or self.corners.shape[-1] != 3:
             raise ValueError(f"corners: expected shape [*batch, C, 3], got {list(self.corners.shape)}")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from lcplearn.datasets import BlockData
+from lcplearn.datasets import Task
 from lcplearn.formulations import Formulation
 from lcplearn.training.checkpoint import describe
 from lcplearn.training.module import FormulationModule
@@ -33,11 +33,11 @@ def hyperparameters(module: FormulationModule, used: Mapping[str, Any], epochs: 
     }
 
 
-def described_data(data: BlockData, settings: Mapping[str, Any] | None) -> dict[str, Any]:
+def described_data(data: Task, settings: Mapping[str, Any] | None) -> dict[str, Any]:
     """The data's settings as far as they are known, and a fingerprint of what is learned from."""
     digest = hashlib.sha256()
     for part in (data.train, data.validation):
-        for tensor in part:
+        for tensor in (part.states, *part.drive, part.steps, part.true_states):
             if tensor is not None:
                 digest.update(tensor.detach().cpu().numpy().tobytes())
     known = {name: value for name, value in (settings or {}).get("data", {}).items() if name != "path"}

@@ -13,9 +13,10 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, Progress
 from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm import tqdm
 
-from lcplearn.datasets import BlockData
+from lcplearn.datasets import Task
 from lcplearn.training.checkpoint import read
-from lcplearn.training.metrics import KEYS, one_step
+from lcplearn.training.figures_of_merit import KEYS
+from lcplearn.training.metrics import one_step
 from lcplearn.training.module import VALIDATION, FormulationModule
 from lcplearn.training.writing import copy, write_figures
 
@@ -29,15 +30,17 @@ TAGS = {
 
 
 class Report(pl.Callback):
-    """Log how the model does on the validation recordings, and learned mu and mass beside the true ones."""
+    """Log how the model does on the validation recordings, and learned numbers beside the true ones."""
 
-    def __init__(self, data: BlockData) -> None:
+    def __init__(self, data: Task) -> None:
         self.data, self.validation = data, data.validation
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.validation = move_data_to_device(self.data.validation, pl_module.device)
         if isinstance(trainer.logger, TensorBoardLogger):
-            pairs = {name: ["Multiline", [f"parameters/{name}$", f"parameters/{name}_true"]] for name in ("mu", "mass")}
+            pairs = {
+                name: ["Multiline", [f"parameters/{name}$", f"parameters/{name}_true"]] for name in self.data.truth
+            }
             trainer.logger.experiment.add_custom_scalars({"learned against true": pairs})
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
@@ -49,8 +52,8 @@ class Report(pl.Callback):
         scalars |= {tag: float(trainer.callback_metrics[tag]) for tag in (VALIDATION, "val/loss")}
         for name, value in model.physical_parameters().items():
             scalars[f"parameters/{name}"] = value
-            if getattr(self.data, name) is not None:
-                scalars[f"parameters/{name}_true"] = getattr(self.data, name)
+            if name in self.data.truth:
+                scalars[f"parameters/{name}_true"] = self.data.truth[name]
         trainer.logger.log_metrics(scalars, step=trainer.global_step)
 
 

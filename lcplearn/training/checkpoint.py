@@ -8,15 +8,39 @@ from typing import Any
 
 import torch
 
-from lcplearn.formulations import Formulation
+from lcplearn.formulations import FORMULATIONS, Formulation
+from lcplearn.scenes.space import Space
 
 PREFIX = "model."  # of the model's entries in the LightningModule's state
 
 
 def describe(model: Formulation) -> dict[str, Any]:
     """Class and constructor arguments of a model, as plain values."""
-    cls = type(model)
-    return {"class": f"{cls.__module__}.{cls.__qualname__}", "arguments": dict(model.arguments)}
+    return {"class": _name(type(model)), "arguments": {k: _plain(value) for k, value in model.arguments.items()}}
+
+
+def _name(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, type):
+        return _name(value)
+    if isinstance(value, torch.Tensor):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, Space):
+        return {name: list(each) if isinstance(each, tuple) else each for name, each in vars(value).items()}
+    return value
+
+
+def _restored(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Constructor arguments as `describe` found them."""
+    if not isinstance(space := arguments.get("space"), Mapping):
+        return dict(arguments)
+    names = {name: tuple(space[name]) for name in ("positions", "velocities")}
+    return {**arguments, "space": Space(**names, rotations=space["rotations"])}
 
 
 def load(path: str | Path, map_location: str | torch.device | None = None, *, trust: bool = False) -> Formulation:
@@ -45,8 +69,10 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
             f"{path} was made with the class {module}.{name}, and importing {module} runs its code: if you trust the "
             f"file, import {module} first, or load with trust=True (--trust on a command line)."
         )
+    ours = {cls.__name__: cls for cls in FORMULATIONS.values()}
     try:
-        cls = getattr(importlib.import_module(module), name)
+        moved = module.startswith("lcplearn.formulations.") and name in ours
+        cls = ours[name] if moved else getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"{path} was made with the class {module}.{name}, which can't be imported here.") from error
     if not (isinstance(cls, type) and issubclass(cls, Formulation)):
@@ -56,7 +82,7 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
     if wrong:
         raise ValueError(f"{path}: {wrong[0]} is not finite; the training that wrote it had diverged.")
     try:
-        model = cls(**checkpoint["formulation"]["arguments"])
+        model = cls(**_restored(checkpoint["formulation"]["arguments"]))
         model.load_state_dict(state)
     except (TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
@@ -116,7 +142,8 @@ def check_resumable(
     if not {"objective", "training", "epoch"} <= set(checkpoint):
         raise ValueError(f"{path} holds a model, but no training that could go on.")
     saved, now = checkpoint["formulation"], ours["formulation"]
-    if saved["class"] != now["class"]:
+    # By name: a module may have moved since.
+    if saved["class"].rpartition(".")[2] != now["class"].rpartition(".")[2]:
         raise ValueError(f"{path} holds {saved['class']}, but the settings ask for {now['class']}: change model=.")
     for name, (before, after) in _differences(saved["arguments"], now["arguments"]).items():
         raise ValueError(f"{path} was trained with model.{name}={before}, but the settings say {after}.")

@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from lcplearn.datasets import BlockData, Recordings
 from lcplearn.formulations import Formulation
-from lcplearn.formulations.formulation import STICK_SPEED
-from lcplearn.training.metrics import rollout, truth, valid_steps
+from lcplearn.scenes.scene import STICK_SPEED, Drive
+from lcplearn.training.metrics import Predictions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,69 +18,67 @@ ROUNDING = 2.2e-16  # of a velocity of 1 m/s
 LEARNED: dict[str, Any] = {"color": "tab:red", "linewidth": 1.4}
 
 
-def draw(model: Formulation, data: BlockData) -> dict[str, "Figure"]:
-    """Draw what applies to the data.
-
-    Args:
-        model: The trained model, on the CPU.
-        data: `BlockData`.
+def draw(found: Predictions) -> dict[str, "Figure"]:
+    """Draw what applies to a task and a model, from predictions that judges have asked for already.
 
     Returns:
-        Figures by name: rollouts, error_over_horizon, and stops on slides, else one_step_map (for models that need no
-        measured friction).
+        Figures by name: rollouts, error_over_horizon; stops on slides; else on a line, for models that need no measured
+        friction, one_step_map.
     """
-    pictures = {"rollouts": rollouts(model, data), "error_over_horizon": error_over_horizon(model, data)}
-    if data.kind == "cube_slides":  # no force acts there
-        pictures["stops"] = stops(model, data)
-    elif not model.needs_friction:
-        pictures["one_step_map"] = one_step_map(model, data)
+    pictures = {"rollouts": rollouts(found), "error_over_horizon": error_over_horizon(found)}
+    if "stops" in found.task.judged_by:
+        pictures["stops"] = stops(found)
+    elif found.model.space.nv == 1 and not found.model.needs_friction:  # no force acts on slides
+        pictures["one_step_map"] = one_step_map(found)
     return pictures
 
 
 @torch.no_grad()
-def one_step_map(model: Formulation, data: BlockData, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3)) -> "Figure":
-    """Velocity after a step against the force, for a few velocities before it, with the true stick band."""
+def one_step_map(found: Predictions, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3)) -> "Figure":
+    """Velocity after a step from position 0 against the force, for a few velocities before it, and the true one."""
     figure, axes = _figure(1, 1, (7.0, 4.5))
-    mass, mu = data.mass or 1.0, data.mu if data.mu is not None else model.physical_parameters().get("mu")
-    limit = (mu or 0.3) * mass * data.gravity
-    reach = 2.5 * limit + max(speeds) * mass / data.dt
-    force = torch.linspace(-reach, reach, 801, dtype=torch.float64)
-    ax = axes[0][0]
+    ax, task = axes[0][0], found.task
+    reach = 2.0 * float(task.test.drive.force.abs().max()) or 1.0
+    force = torch.linspace(-reach, reach, 801, dtype=torch.float64).unsqueeze(-1)
+    drive = Drive(force)
     for index, speed in enumerate(speeds):
-        colour = f"C{index}"
-        after = model.next_velocity(torch.full_like(force, speed), force)
-        if data.mu is not None:
-            p, c = speed + force * data.dt / mass, data.mu * data.gravity * data.dt
-            exact = p.sign() * (p.abs() - c).clamp(min=0.0)
+        state = torch.tensor([0.0, speed], dtype=torch.float64).expand(len(force), 2)
+        colour, after = f"C{index}", found.model.advance(state, drive).state[:, 1]
+        if task.scene is not None:
+            exact = task.scene.advance(state, drive).state[:, 1]
             ax.plot(force, exact, color=colour, linewidth=5, alpha=0.25)
+            sticks = force[exact.abs() < STICK_SPEED]
+            if speed == 0.0 and len(sticks):
+                band = (float(sticks.min()), float(sticks.max()))
+                ax.axvspan(*band, color="0.9", zorder=0, label="sticks from rest")
         ax.plot(force, after, color=colour, linewidth=1.4, label=f"from {speed:+.1f} m/s" if speed else "from rest")
-    if data.mu is not None:
-        ax.axvspan(-limit, limit, color="0.9", zorder=0, label="sticks from rest")
     ax.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
     ax.set(xlabel="force [N]", ylabel="velocity after the step [m/s]")
-    wide = " (thin) and truth (wide)" if data.mu is not None else ""
+    wide = " (thin) and truth (wide)" if task.scene is not None else ""
     ax.set_title(f"One-step map: learned{wide}")
     ax.legend(fontsize=9)
     return figure
 
 
-def rollouts(model: Formulation, data: BlockData, count: int = 3) -> "Figure":
-    """Velocity of a few test recordings, predicted from their start; strips below show when the block rests."""
+def rollouts(found: Predictions, count: int = 3) -> "Figure":
+    """Velocity (or speed) of a few test recordings, predicted from their start; strips show when the body rests."""
     figure, axes = _figure(count, 1, (8.0, 2.1 * count + 0.6))
-    chosen = torch.linspace(0, len(data.test.steps) - 1, count).long()  # those from rest come first
-    test = Recordings(*(None if field is None else field[chosen] for field in data.test))  # type: ignore[arg-type]
-    _, velocity = rollout(model, test)
-    true, name = truth(test), "recorded" if data.kind == "cube_slides" else "true"
+    task, model = found.task, found.model
+    chosen = torch.linspace(0, len(task.test.steps) - 1, count).long()  # those from rest come first
+    test = task.test.map(lambda values: values[chosen])
+    simulated = test.true_states is not None
+    velocity, true = (_velocity(model, v) for v in (found.test.velocities[chosen], model.space.split(test.truth)[1]))
+    name = "true" if simulated else "recorded"
     for row, ax in enumerate(ax for line in axes for ax in line):
         steps = int(test.steps[row])
-        time = torch.arange(steps + 1) * data.dt
+        time = torch.arange(steps + 1) * task.dt
         ax.plot(time, true[row, : steps + 1], label=name, **TRUE)
         predicted = velocity[row, : steps + 1]
         low, high = _limits(predicted, true[row, : steps + 1])
         far = 10.0 * max(-low, high)  # outside of the axes, where matplotlib can still draw it
         ax.plot(time, predicted.clamp(-far, far), label="rolled out from the start", **LEARNED)
         ax.set(ylim=(low - 0.22 * (high - low), high), ylabel="velocity [m/s]")
-        if data.test.true_velocities is not None:  # a measured velocity is never exactly zero
+        if simulated:  # a measured velocity is never exactly zero
             strip(ax, time, true[row, : steps + 1], 0.01, "black", "true at rest", alpha=0.35)
         strip(ax, time, velocity[row, : steps + 1], 0.08, "tab:red", "predicted at rest")
     axes[-1][0].set_xlabel("time [s]")
@@ -89,13 +86,12 @@ def rollouts(model: Formulation, data: BlockData, count: int = 3) -> "Figure":
     return figure
 
 
-def stops(model: Formulation, data: BlockData) -> "Figure":
+def stops(found: Predictions) -> "Figure":
     """How far each slide goes: predicted from its start against recorded."""
     figure, axes = _figure(1, 1, (5.2, 4.8))
-    test = data.test
-    position, _ = rollout(model, test)
-    rows = torch.arange(len(test.steps))
-    predicted, recorded = (1e3 * (x[rows, test.steps] - x[:, 0]) for x in (position, test.positions))
+    test = found.task.test
+    rows, positions = torch.arange(len(test.steps)), (found.test.positions[..., 0], test.states[..., 0])
+    predicted, recorded = (1e3 * (x[rows, test.steps] - x[:, 0]) for x in positions)
     diverged = int((~predicted.isfinite()).sum())
     ax, reach = axes[0][0], float(recorded.max())
     ax.plot([0.0, reach], [0.0, reach], color="0.6", linewidth=1.0)
@@ -124,13 +120,13 @@ def strip(
     )  # fmt: skip
 
 
-def error_over_horizon(model: Formulation, data: BlockData) -> "Figure":
+def error_over_horizon(found: Predictions) -> "Figure":
     """Root mean square and largest error of the velocity against the steps since the start of the rollout."""
     figure, axes = _figure(1, 1, (7.0, 4.0))
-    recordings = data.test_long if data.test_long is not None else data.test
-    _, velocity = rollout(model, recordings)
-    error = (velocity - truth(recordings))[:, 1:].abs()
-    known = valid_steps(recordings)
+    recordings, path = found.long_recordings, found.long
+    predicted = torch.cat((path.positions, path.velocities), dim=-1)
+    error = found.model.velocity_error(predicted[:, 1:], recordings.truth[:, 1:]).sqrt()
+    known = recordings.valid
     error = torch.where(known, error, 0.0)
     error = error.nan_to_num(nan=1e12).clamp(max=1e12)  # more is not drawn: it has diverged
     rms = (error.square().sum(0) / known.sum(0).clamp(min=1)).sqrt()
@@ -146,6 +142,10 @@ def error_over_horizon(model: Formulation, data: BlockData) -> "Figure":
     ax.grid(alpha=0.3)
     ax.legend(fontsize=9)
     return figure
+
+
+def _velocity(model: Formulation, velocities: Tensor) -> Tensor:
+    return velocities[..., 0] if model.space.nv == 1 else model.space.speed(velocities, model.radius)
 
 
 def _limits(predicted: Tensor, true: Tensor) -> tuple[float, float]:

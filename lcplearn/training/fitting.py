@@ -18,8 +18,9 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.multiprocessing import ProcessRaisedException
 from torch.utils.data import DataLoader
 
-from lcplearn.datasets import BlockData, WindowLoader, windows
-from lcplearn.formulations import Formulation, Windows, loss_terms
+from lcplearn.datasets import Task, WindowLoader, Windows, windows
+from lcplearn.formulations import Formulation, loss_terms
+from lcplearn.scenes.space import Space
 from lcplearn.training.asked import described_data, described_model, flat, hyperparameters, plain, taken, write_config
 from lcplearn.training.callbacks import (
     BestCheckpoint,
@@ -53,7 +54,7 @@ class Result:
 
     Attributes:
         model: The model with the parameters that validated best.
-        metrics: Figures on the test data, see `metrics.KEYS`; None on processes other than the first.
+        metrics: Figures on the test data, see `metrics.evaluate`; None on processes other than the first.
         validation: Smallest velocity error on the validation data, over the steps of a window [m/s].
         folder: Folder of the run.
     """
@@ -66,7 +67,7 @@ class Result:
 
 def fit(
     model: Formulation,
-    data: BlockData,
+    data: Task,
     *,
     loss: Mapping[str, float] | None = None,
     horizon: int = 1,
@@ -111,17 +112,13 @@ def fit(
         TrainingInterrupted: a signal ended the training.
     """
     loss, optimizer = dict(loss or {"prediction": 1.0}), optimizer or Optimizer()
-    if (model.dt, model.gravity) != (data.dt, data.gravity):
-        raise ValueError(
-            f"model: expected dt = {data.dt} s and gravity = {data.gravity} m/s^2 as in the data, "
-            f"got {model.dt} and {model.gravity}"
-        )
+    _check_agreement(model, data)
     if epochs < 1:
         raise ValueError(f"epochs: expected at least 1, got {epochs}")
     folder = _new_folder(folder)
     _quiet()
     batches, validation = windows(data.train, horizon), windows(data.validation, horizon)
-    _try_once(model, _first(batches), loss)
+    _try_once(model, batches.map(lambda values: values[:1]), loss)
     loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
     chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
     every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
@@ -215,9 +212,24 @@ def _plugins(given: Any) -> list[Any]:
     return [] if given is None else list(given) if isinstance(given, list | tuple) else [given]
 
 
+def _check_agreement(model: Formulation, data: Task) -> None:
+    """A model of another time step, space or gravity would learn, but something else."""
+    ours = {"dt": model.dt, "space": model.space, **model.given}
+    theirs = {"dt": data.dt, "space": data.space, **data.given}
+    for name in sorted(ours.keys() & theirs.keys()):
+        if isinstance(ours[name], int | float | Space) and ours[name] != theirs[name]:
+            raise ValueError(f"model: expected {name} = {theirs[name]} as in the data, got {ours[name]}")
+
+
 def _try_once(model: Formulation, window: Windows, loss: Mapping[str, float]) -> None:
     """Refuse what doesn't fit before anything is written, and compile the solver before the clock starts."""
     torch.stack([*loss_terms(model, window, loss).values()]).sum().backward()
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad and parameter.grad is None:
+            terms = ", ".join(term for term, weight in loss.items() if weight)
+            raise ValueError(
+                f"model: expected a loss ({terms}) that depends on all that is learned, got no {name} in it"
+            )
     model.zero_grad()
 
 
@@ -236,11 +248,6 @@ def _trainer_errors() -> Iterator[None]:
         yield
     except MisconfigurationException as error:
         raise ValueError(f"Lightning's Trainer can't use these settings: {' '.join(str(error).split())}") from error
-
-
-def _first(batch: Windows) -> Windows:
-    friction = None if batch.friction is None else batch.friction[:1]
-    return Windows(batch.velocity[:1], batch.force[:1], friction, batch.valid[:1])
 
 
 def _quiet() -> None:

@@ -1,67 +1,58 @@
-"""What a trained model is judged by: the figures of metrics.json."""
+"""How a trained model is judged: the figures of metrics.json."""
 
 import math
 import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lcplearn.datasets import BlockData, Recordings
+from lcplearn.datasets import Recordings, Task
 from lcplearn.formulations import Formulation
-from lcplearn.formulations.formulation import STICK_SPEED
+from lcplearn.scenes.scene import STICK_SPEED, Step, Trajectory
+from lcplearn.training.figures_of_merit import KEYS, figure, in_order
 
-KEYS = (
-    "velocity_rmse",
-    "stick_accuracy",
-    "false_stick",
-    "rollout_rmse_100",
-    "rollout_rmse_1000",
-    "mu_error",
-    "mass_error",
-    "unsolved_share",
-    "train_seconds",
-    "predict_us",
-    "parameters",
-    "stop_error_median_mm",
-    "stop_error_p90_mm",
-    "rest_share",
-    "mu",
-)
-UNITS = {
-    "velocity_rmse": "m/s, one step",
-    "stick_accuracy": "share of true sticks with |v| < 1e-12 m/s",
-    "false_stick": "share of true slips with |v| < 1e-12 m/s",
-    "rollout_rmse_100": "m/s, over 100 steps",
-    "rollout_rmse_1000": "m/s, over 1000 steps",
-    "mu_error": "|learned - true|",
-    "mass_error": "kg, |learned - true|",
-    "unsolved_share": "share of LCPs without a verified solution",
-    "train_seconds": "s",
-    "predict_us": "us, one step of one block",
-    "parameters": "learned numbers",
-    "stop_error_median_mm": "mm, where the slide ends",
-    "stop_error_p90_mm": "mm, 90th percentile",
-    "rest_share": "share of slides at rest at their end",
-    "mu": "learned friction coefficient",
-}
+Figures = dict[str, float | None]
 
 
-def truth(recordings: Recordings) -> Float[Tensor, "N T+1"]:
-    """Noise-free velocities where they are known, else the measured ones [m/s]."""
-    return recordings.velocities if recordings.true_velocities is None else recordings.true_velocities
+class Predictions:
+    """What a model predicts of a task's test recordings, each computed once: judges and pictures share them.
 
+    Args:
+        model: The model, on the CPU.
+        task: What it is judged on.
+    """
 
-def valid_steps(recordings: Recordings) -> Bool[Tensor, "N T"]:
-    """False after the end of a shorter recording."""
-    steps = recordings.steps
-    return torch.arange(recordings.forces.shape[1], device=steps.device) < steps[:, None]
+    def __init__(self, model: Formulation, task: Task) -> None:
+        self.model, self.task = model, task
+
+    @property
+    def long_recordings(self) -> Recordings:
+        """The recordings for long rollouts."""
+        return self.task.test if self.task.test_long is None else self.task.test_long
+
+    @cached_property
+    def test(self) -> Trajectory:
+        """Rollouts of the test recordings."""
+        return rollout(self.model, self.task.test)
+
+    @cached_property
+    def long(self) -> Trajectory:
+        """Rollouts of the long recordings."""
+        return self.test if self.task.test_long is None else rollout(self.model, self.task.test_long)
 
 
 @torch.no_grad()
-def one_step(model: Formulation, recordings: Recordings) -> dict[str, float | None]:
+def rollout(model: Formulation, recordings: Recordings) -> Trajectory:
+    """Predict recordings from their first true state and what drives them."""
+    return model.rollout(recordings.truth[:, 0], recordings.drive.force, recordings.drive.friction)
+
+
+@torch.no_grad()
+def one_step(model: Formulation, recordings: Recordings) -> Figures:
     """Judge one step from every true state of the recordings.
 
     Stick figures need exact zeros in the truth, so real recordings have none.
@@ -69,68 +60,86 @@ def one_step(model: Formulation, recordings: Recordings) -> dict[str, float | No
     Returns:
         velocity_rmse [m/s], stick_accuracy, false_stick, unsolved_share, lcp_residual (None: does not apply).
     """
-    known, velocity = valid_steps(recordings), truth(recordings)
-    before, after, force = velocity[:, :-1][known], velocity[:, 1:][known], recordings.forces[known]
-    friction = None if recordings.friction is None else recordings.friction[known]
-    model.last_solution = None
-    predicted = model.next_velocity(before, force, friction)
-    sticks, still = after.abs() < STICK_SPEED, predicted.abs() < STICK_SPEED
-    simulated, solution = recordings.true_velocities is not None, model.last_solution
+    known, states, space = recordings.valid, recordings.truth, model.space
+    after = states[:, 1:][known]
+    step: Step = model.advance(states[:, :-1][known], recordings.drive.map(lambda values: values[known]))
+    predicted, velocity = (space.split(state)[1] for state in (step.state, after))
+    sticks, still = (space.speed(v, model.radius) < STICK_SPEED for v in (velocity, predicted))
+    simulated = recordings.true_states is not None
     return {
-        "velocity_rmse": _rms(predicted - after),
+        "velocity_rmse": _rms(model.velocity_error(step.state, after)),
         "stick_accuracy": _share(still[sticks]) if simulated else None,
         "false_stick": _share(still[~sticks]) if simulated else None,
-        "unsolved_share": None if solution is None else 1.0 - float(solution.solved.double().mean()),
-        "lcp_residual": None if solution is None else float(solution.residual.max()),
+        "unsolved_share": None if step.solved is None else 1.0 - float(step.solved.double().mean()),
+        "lcp_residual": None if step.solution is None else float(step.solution.residual.max()),
     }
 
 
-@torch.no_grad()
-def rollout(model: Formulation, recordings: Recordings, steps: int | None = None) -> tuple[Tensor, Tensor]:
-    """Predict recordings from their first true state and their forces.
-
-    Returns:
-        Positions [m] and velocities [m/s], both [N, T + 1].
-    """
-    steps = steps or recordings.forces.shape[1]
-    state = torch.stack((recordings.positions[:, 0], truth(recordings)[:, 0]), dim=-1)
-    friction = None if recordings.friction is None else recordings.friction[:, :steps]
-    path = model.rollout(state, recordings.forces[:, :steps, None], friction)
-    return path.positions[..., 0], path.velocities[..., 0]
+def judge_one_step(found: Predictions) -> Figures:
+    """Figures of one step; see `one_step`."""
+    return {name: value for name, value in one_step(found.model, found.task.test).items() if name in KEYS}
 
 
-def evaluate(model: Formulation, data: BlockData, *, train_seconds: float | None = None) -> dict[str, float | None]:
+def judge_rollout(found: Predictions) -> Figures:
+    """Velocity error over 100 steps of the test recordings and 1000 of the long ones, where they are so long."""
+    long = found.long if found.task.test_long is not None else None
+    return {
+        "rollout_rmse_100": _rollout_rmse(found.model, found.test, found.task.test, 100),
+        "rollout_rmse_1000": None if long is None else _rollout_rmse(found.model, long, found.long_recordings, 1000),
+    }
+
+
+def judge_stops(found: Predictions) -> Figures:
+    """Where slides on a line end, and whether they end at rest."""
+    slides, path = found.task.test, found.test
+    rows, last = torch.arange(len(slides.steps)), slides.steps
+    error = (path.positions[rows, last, 0] - slides.states[rows, last, 0]).abs() * 1e3
+    return {
+        "stop_error_median_mm": float(error.quantile(0.5)),
+        "stop_error_p90_mm": float(error.quantile(0.9)),
+        "rest_share": _share(path.velocities[rows, last, 0].abs() < STICK_SPEED),
+    }
+
+
+JUDGES: dict[str, Callable[[Predictions], Figures]] = {
+    "one_step": judge_one_step,
+    "rollout": judge_rollout,
+    "stops": judge_stops,
+}
+
+
+def evaluate(
+    model: Formulation, task: Task, *, train_seconds: float | None = None, predictions: Predictions | None = None
+) -> Figures:
     """Evaluate a model on the test part of a data set.
 
     Args:
         model: The model, on the CPU.
-        data: `BlockData`.
+        task: Names its judges.
         train_seconds: Reported as it comes.
+        predictions: The model's, if somebody else wants them too.
 
     Returns:
-        All `KEYS`; None where a figure does not apply, infinite where it is not finite. `UNITS` says what each is.
+        All `KEYS`, and learned numbers by name; None where a figure does not apply, infinite where it is not finite.
     """
-    values: dict[str, float | None] = dict.fromkeys(KEYS)
-    values |= {key: value for key, value in one_step(model, data.test).items() if key in KEYS}
-    learned = model.physical_parameters()
-    values["mu"] = learned.get("mu")
-    for name, true in (("mu", data.mu), ("mass", data.mass)):
-        if name in learned and true is not None and data.kind != "cube_slides":
-            values[f"{name}_error"] = abs(learned[name] - true)
-    if data.kind == "cube_slides":
-        values |= _stops(model, data.test)
-    else:
-        values["rollout_rmse_100"] = _rollout_rmse(model, data.test, 100)
-        values["rollout_rmse_1000"] = _rollout_rmse(model, data.test_long, 1000)
+    found = Predictions(model, task) if predictions is None else predictions
+    values: Figures = dict.fromkeys(KEYS)
+    for name in task.judged_by:
+        values |= JUDGES[name](found)
+    for name, learned in model.physical_parameters().items():
+        if name in task.truth:
+            values[f"{name}_error"] = abs(learned - task.truth[name])
+        values[name] = learned
     values["train_seconds"] = train_seconds
-    values["predict_us"] = _predict_us(model, data.test)
+    values["predict_us"] = _predict_us(model, task.test)
     values["parameters"] = sum(p.numel() for p in model.parameters() if p.requires_grad)
     return {key: math.inf if value is not None and math.isnan(value) else value for key, value in values.items()}
 
 
 def table(metrics: Mapping[str, float | None]) -> list[tuple[str, str, str]]:
     """Rows (name, value, meaning) of the figures that apply."""
-    return [(key, number(metrics[key]), UNITS[key]) for key in KEYS if metrics[key] is not None]
+    there = [name for name in in_order(metrics) if metrics[name] is not None]
+    return [(name, number(metrics[name]), figure(name).meaning) for name in there]
 
 
 def number(value: float | None) -> str:
@@ -147,50 +156,35 @@ def format_table(metrics: Mapping[str, float | None]) -> str:
     return "\n".join(f"{name:<22}{value:>12}   {unit}" for name, value, unit in table(metrics))
 
 
-def describe_model(model: Formulation, data: BlockData) -> str:
+def describe_model(model: Formulation, task: Task) -> str:
     """One line: what learns, how large it is, and from what."""
     parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
     dtype = str(next(model.parameters()).dtype).removeprefix("torch.")
-    steps = int(data.train.steps.sum())
+    steps = int(task.train.steps.sum())
     counted = f"{parameters} parameter{'s' * (parameters != 1)}"
-    return f"{type(model).__name__}: {counted} ({dtype}); {data.kind}: {steps} training steps"
+    return f"{type(model).__name__}: {counted} ({dtype}); {task.name}: {steps} training steps"
 
 
-def _stops(model: Formulation, slides: Recordings) -> dict[str, float | None]:
-    position, velocity = rollout(model, slides)
-    rows, last = torch.arange(len(slides.steps)), slides.steps
-    error = (position[rows, last] - slides.positions[rows, last]).abs() * 1e3
-    return {
-        "stop_error_median_mm": float(error.quantile(0.5)),
-        "stop_error_p90_mm": float(error.quantile(0.9)),
-        "rest_share": _share(velocity[rows, last].abs() < STICK_SPEED),
-    }
-
-
-def _rollout_rmse(model: Formulation, recordings: Recordings | None, steps: int) -> float | None:
-    if recordings is None or recordings.forces.shape[1] < steps:
+def _rollout_rmse(model: Formulation, path: Trajectory, recordings: Recordings, steps: int) -> float | None:
+    if not bool((recordings.steps >= steps).all()):
         return None
-    whole = recordings.steps >= steps
-    if not bool(whole.all()):
-        return None
-    _, velocity = rollout(model, recordings, steps)
-    return _rms(velocity[:, 1:] - truth(recordings)[:, 1 : steps + 1])
+    predicted = torch.cat((path.positions, path.velocities), dim=-1)
+    return _rms(model.velocity_error(predicted[:, 1 : steps + 1], recordings.truth[:, 1 : steps + 1]))
 
 
 @torch.no_grad()
 def _predict_us(model: Formulation, recordings: Recordings, repeats: int = 200) -> float:
-    velocity, force = truth(recordings)[:1, 0], recordings.forces[:1, 0]
-    friction = None if recordings.friction is None else recordings.friction[:1, 0]
+    state, drive = recordings.truth[:1, 0], recordings.drive.map(lambda values: values[:1, 0])
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        model.next_velocity(velocity, force, friction)
+        model.advance(state, drive)
         seconds.append(time.perf_counter() - start)
     return statistics.median(seconds) * 1e6
 
 
-def _rms(error: Tensor) -> float:
-    return float(error.square().mean().sqrt())
+def _rms(squares: Float[Tensor, "*shape"]) -> float:
+    return float(squares.mean().sqrt())
 
 
 def _share(flags: Bool[Tensor, " n"]) -> float | None:

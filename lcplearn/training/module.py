@@ -8,8 +8,8 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from lcplearn.formulations import Formulation, Windows, loss_terms
-from lcplearn.formulations.structured import FrictionLCP
+from lcplearn.datasets import Windows
+from lcplearn.formulations import Formulation, loss_terms
 from lcplearn.training.checkpoint import describe
 from lcplearn.training.optimizer import Optimizer
 
@@ -91,10 +91,9 @@ class FormulationModule(pl.LightningModule):
     def validation_step(self, windows: Windows, index: int) -> None:
         # The best model is the one that predicts best as it is deployed. The loss may say otherwise: that of `direct`
         # has a floor which differs between training and validation data although the velocity is exact.
-        deployed = loss_terms(self.model, windows, {"rollout": 1.0})["rollout"].sqrt()
-        total = self._total(loss_terms(self.model, windows, self.loss))
-        values = {VALIDATION: deployed, "val/loss": total}
-        self.log_dict(values, sync_dist=True, batch_size=len(windows.velocity), logger=False)  # callbacks.Report does
+        terms = loss_terms(self.model, windows, {"rollout": 1.0} | {k: v for k, v in self.loss.items() if v})
+        values = {VALIDATION: terms["rollout"].sqrt(), "val/loss": self._total(terms)}
+        self.log_dict(values, sync_dist=True, batch_size=len(windows.valid), logger=False)  # callbacks.Report does
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint.update(self.described, train_seconds=self.seconds)
@@ -115,17 +114,11 @@ class FormulationModule(pl.LightningModule):
         return self.seconds_before + time.perf_counter() - self.started
 
     def _terms(self, windows: Windows) -> dict[str, Tensor]:
-        temperature = self.optimizer.temperature(self.current_epoch)
-        if not temperature or not isinstance(self.model, FrictionLCP):
+        with self.model.softened(self.optimizer.temperature(self.current_epoch)):
             return loss_terms(self.model, windows, self.loss)
-        self.model.temperature = temperature
-        try:
-            return loss_terms(self.model, windows, self.loss)
-        finally:
-            self.model.temperature = 0.0  # whoever predicts, validation included, sees the exact threshold
 
     def _total(self, terms: Mapping[str, Tensor]) -> Tensor:
-        return torch.stack([self.loss[name] * term for name, term in terms.items()]).sum()
+        return torch.stack([self.loss[name] * term for name, term in terms.items() if self.loss.get(name)]).sum()
 
     def _optimizers(self) -> list[Any]:
         found = self.optimizers()

@@ -8,10 +8,10 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from lcplearn.datasets import BlockData
+from lcplearn.datasets import Task
 from lcplearn.formulations import Formulation
 from lcplearn.training import figures
-from lcplearn.training.metrics import evaluate, table
+from lcplearn.training.metrics import Predictions, evaluate, table
 from lcplearn.training.writing import write_figures
 
 # The figures that stand beside the hyperparameters; metrics.json and the table have all.
@@ -22,24 +22,25 @@ MAIN = (
 
 
 def leave(
-    trainer: pl.Trainer, model: Formulation, data: BlockData, folder: Path, used: Mapping[str, Any], seconds: float
+    trainer: pl.Trainer, model: Formulation, task: Task, folder: Path, used: Mapping[str, Any], seconds: float
 ) -> dict[str, float | None]:
     """Judge the model, and write metrics.json, the pictures and the logger's page.
 
     Args:
         trainer: Whose logger is told.
         model: The trained model, on the CPU.
-        data: Whose test part judges.
+        task: Whose test part judges.
         folder: The run's.
         used: What it was trained with, by name, as HPARAMS shows it.
         seconds: Time of training [s].
 
     Returns:
-        The figures, see `metrics.KEYS`.
+        The figures, see `metrics.evaluate`.
     """
-    metrics = evaluate(model, data, train_seconds=seconds)
+    predictions = Predictions(model, task)
+    metrics = evaluate(model, task, train_seconds=seconds, predictions=predictions)
     write_figures(folder / "metrics.json", metrics)
-    pictures = figures.draw(model, data)
+    pictures = figures.draw(predictions)
     for name, figure in pictures.items():
         # Pictures are looked at side by side and far from their folder.
         figure.suptitle(f"{type(model).__name__}   {folder.name}", fontsize=11)

@@ -14,10 +14,8 @@ from typing import Any
 
 import yaml
 
-# As in formulations/losses.py, which imports torch; a test compares them.
-LOSS_TERMS = ("prediction", "rollout", "complementarity", "nonnegativity", "violation")
 TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
-FROM_DATA = {"dt", "gravity"}  # of a model, which takes them from its data
+FROM_DATA = {"dt", "gravity", "space", "given"}  # of a model, which takes them from its data
 UNLIKELY = {"min_epochs"}  # what nobody means who writes something alike
 # Ranges that the targets check too, seconds later: of data, model and optimizer.
 POSITIVE = {"dt", "mass", "trajectories", "length", "width", "initial_mass", "lr", "lbfgs_iterations", "shift"}
@@ -59,7 +57,7 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
     if settings["batch_size"] is not None and settings["optimizer"].get("lbfgs_after") is not None:
         raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
     _check_ranges(settings)
-    _check_loss(settings["loss"])
+    _check_loss(settings["loss"], _vocabulary(conf, "loss")[0])
     length, horizon = settings["data"].get("length"), settings["loss"].get("horizon", 1)
     if length is not None and horizon > length:
         raise SettingsError(f"loss.horizon={horizon} is longer than the recordings: data.length={length}.")
@@ -138,13 +136,14 @@ def _check_friction(settings: Mapping[str, Any]) -> None:
         raise SettingsError(f"model={model.lower()} needs friction labels: set data.friction={kinds}.")
 
 
-def _check_loss(loss: Mapping[str, Any]) -> None:
+def _check_loss(loss: Mapping[str, Any], known: Iterable[str]) -> None:
+    """Terms and horizon are those that the files in conf/loss/ name."""
     for key, value in loss.items():
-        _known(key, (*LOSS_TERMS, "horizon"), "setting", prefix="loss.")
+        _known(key, sorted(known), "setting", prefix="loss.")
         _check_type(f"loss.{key}", value, "int" if key == "horizon" else "float")
         if not 0 <= value < float("inf"):
             raise SettingsError(f"loss.{key} must be finite and at least 0, got {value}.")
-    if not any(loss.get(term) for term in LOSS_TERMS):
+    if not any(value for key, value in loss.items() if key != "horizon"):
         raise SettingsError("All loss weights are zero: set one, for instance loss.prediction=1.0.")
     if loss.get("horizon", 1) < 1:
         raise SettingsError(f"loss.horizon must be at least 1, got {loss['horizon']}.")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from real_data import real_data
 
-from lcplearn.datasets import BlockData, find, read_cube_slides
+from lcplearn.datasets import Task, find, read_cube_slides
 from lcplearn.datasets.cube_slides import COLUMNS
 
 
@@ -34,7 +34,7 @@ def arrays(slides: int = 6, rows: int = 5) -> dict[str, np.ndarray]:
     }
 
 
-def read(path: Path, **changes: np.ndarray | None) -> BlockData:
+def read(path: Path, **changes: np.ndarray | None) -> Task:
     content = {name: value for name, value in {**arrays(), **changes}.items() if value is not None}
     np.savez(path, **content)
     return read_cube_slides(path, training_slides=3, validation_slides=1)
@@ -44,7 +44,7 @@ def test_real_slides_are_split_into_40_to_learn_from_and_403_to_test_on(slides):
     data = read_cube_slides(slides)
     sizes = [len(part.steps) for part in (data.train, data.validation, data.test)]
     assert sizes == [32, 8, 403]
-    assert (data.mu, data.mass, data.gravity, data.test_long) == (None, 0.37, 9.81, None)
+    assert (data.truth, data.given, data.test_long) == ({}, {"mass": 0.37, "gravity": 9.81}, None)
     assert data.dt == pytest.approx(1 / 148)
 
 
@@ -52,13 +52,13 @@ def test_real_slides_lose_velocity_at_mu_g(slides):
     """data/README: mu = 0.216, no applied force; velocity is the backward difference of position."""
     data = read_cube_slides(slides)
     part = data.test
-    assert (part.forces == 0).all()
-    assert part.friction is None
-    assert part.true_velocities is None
-    moving = part.velocities[:, 1:] > 0.1
-    mu = -part.velocities.diff(dim=1)[moving] / (9.81 * data.dt)
+    assert (part.drive.force[..., 0] == 0).all()
+    assert part.drive.friction is None
+    assert part.true_states is None
+    moving = part.states[:, 1:, 1] > 0.1
+    mu = -part.states[..., 1].diff(dim=1)[moving] / (9.81 * data.dt)
     assert mu.median().item() == pytest.approx(0.215, abs=0.01)
-    rate = part.positions.diff(dim=1)[moving] / data.dt - part.velocities[:, 1:][moving]
+    rate = part.states[..., 0].diff(dim=1)[moving] / data.dt - part.states[:, 1:, 1][moving]
     assert rate.abs().median() < 0.01
 
 
@@ -66,8 +66,8 @@ def test_slides_are_padded_with_their_last_row_and_appear_once(slides):
     data = read_cube_slides(slides, seed=7)
     stops = []
     for part in (data.train, data.validation, data.test):
-        last = part.positions.gather(1, part.steps[:, None])[:, 0]
-        assert torch.equal(part.positions[:, -1], last)
+        last = part.states[..., 0].gather(1, part.steps[:, None])[:, 0]
+        assert torch.equal(part.states[:, -1, 0], last)
         stops += last.tolist()
     with np.load(slides) as file:
         expected = file["data"][file["offsets"][1:] - 1, COLUMNS.index("s_m")]
@@ -77,7 +77,7 @@ def test_slides_are_padded_with_their_last_row_and_appear_once(slides):
 def test_the_split_depends_on_the_seed_only(tmp_path):
     np.savez(tmp_path / "a.npz", **arrays(20))
     parts = [
-        read_cube_slides(tmp_path / "a.npz", seed=seed, training_slides=10, validation_slides=2).train.velocities
+        read_cube_slides(tmp_path / "a.npz", seed=seed, training_slides=10, validation_slides=2).train.states[..., 1]
         for seed in (0, 0, 1)
     ]
     assert torch.equal(parts[0], parts[1])

@@ -6,28 +6,28 @@ import numpy as np
 import pytest
 import torch
 
-from lcplearn.datasets import BlockData, read_recordings
+from lcplearn.datasets import Task, read_recordings
 
 
-def read(path: Path, **changes: np.ndarray | float) -> BlockData:
+def read(path: Path, **changes: np.ndarray | float) -> Task:
     arrays = {"dt": 0.1, "positions": np.zeros((2, 4)), "velocities": np.ones((2, 4)), "forces": np.zeros((2, 3))}
     np.savez(path / "mine.npz", **(arrays | changes))  # type: ignore[arg-type]
-    return read_recordings(path / "mine.npz", gravity=1.62)
+    return read_recordings(path / "mine.npz", given={"gravity": 1.62})
 
 
 def test_what_is_not_in_the_file_is_unknown_and_no_step_is_padding(tmp_path: Path) -> None:
     data = read(tmp_path)
-    assert (data.dt, data.gravity, data.mu, data.mass) == (0.1, 1.62, None, None)
+    assert (data.dt, data.given, data.truth) == (0.1, {"gravity": 1.62}, {})
     assert data.test.steps.tolist() == [3, 3]
-    assert data.test.friction is None
-    assert data.test.true_velocities is None
+    assert data.test.drive.friction is None
+    assert data.test.true_states is None
 
 
 def test_whole_numbers_are_read_as_float64(tmp_path: Path) -> None:
     data = read(tmp_path, forces=np.zeros((2, 3), dtype=int), steps=np.array([1, 3]), mu=1)
-    assert data.test.forces.dtype == torch.float64
+    assert data.test.drive.force[..., 0].dtype == torch.float64
     assert data.test.steps.tolist() == [1, 3]
-    assert data.mu == 1.0
+    assert data.truth == {"mu": 1.0}
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lcplearn.datasets import BlockData, Recordings, simulate_falling_block, simulate_sliding_block
+from lcplearn.datasets import Recordings, Task, simulate_falling_block, simulate_sliding_block
 from lcplearn.datasets.simulate import friction_labels
 from lcplearn.scenes import FallingBlock, SlidingBlock
 
@@ -14,34 +14,40 @@ LIMIT = MU * MASS * GRAVITY
 SPLITS = ("train", "validation", "test", "test_long")
 
 
-def splits(data: BlockData) -> list[Recordings]:
+def splits(data: Task) -> list[Recordings]:
     return [getattr(data, name) for name in SPLITS]
 
 
 def share_at_rest(recordings: Recordings) -> float:
-    return (recordings.true_velocities[:, 1:] == 0).double().mean().item()
+    return (recordings.true_states[:, 1:, 1] == 0).double().mean().item()
 
 
-def same(one: BlockData, other: BlockData) -> bool:
-    return all(torch.equal(a.velocities, b.velocities) for a, b in zip(splits(one), splits(other), strict=True))
+def same(one: Task, other: Task) -> bool:
+    return all(torch.equal(a.states[..., 1], b.states[..., 1]) for a, b in zip(splits(one), splits(other), strict=True))
 
 
 def test_sliding_recordings_have_the_default_sizes_and_the_truth():
     """20 x 100 to train on, 40 x 100 for one step, 20 x 1000 for rollouts."""
     data = simulate_sliding_block()
-    assert [tuple(part.forces.shape) for part in splits(data)] == [(20, 100), (10, 100), (40, 100), (20, 1000)]
-    assert all(part.velocities.shape[1] == part.positions.shape[1] == part.forces.shape[1] + 1 for part in splits(data))
-    assert all((part.steps == part.forces.shape[1]).all() for part in splits(data))
-    assert (data.kind, data.mu, data.mass, data.dt, data.gravity) == ("sliding_block", MU, MASS, DT, GRAVITY)
+    assert [tuple(part.drive.force.shape) for part in splits(data)] == [
+        (20, 100, 1),
+        (10, 100, 1),
+        (40, 100, 1),
+        (20, 1000, 1),
+    ]
+    assert all(part.states.shape[1] == part.drive.force.shape[1] + 1 for part in splits(data))
+    assert all((part.steps == part.drive.force[..., 0].shape[1]).all() for part in splits(data))
+    assert (data.name, data.dt) == ("sliding_block", DT)
+    assert (data.truth, data.given) == ({"mu": MU, "mass": MASS}, {"gravity": GRAVITY})
 
 
 @pytest.mark.parametrize("form", ["direct", "traditional"])
 def test_sliding_recordings_are_rollouts_of_the_scene(form):
     part = simulate_sliding_block(mu=0.3, mass=0.7, dt=0.02).test
-    start = torch.stack((part.positions[:, 0], part.velocities[:, 0]), dim=-1)
-    path = SlidingBlock(0.7, 0.3, 0.02, form=form).rollout(start, part.forces.unsqueeze(-1))
-    torch.testing.assert_close(part.velocities, path.velocities[..., 0], rtol=0, atol=1e-12)
-    torch.testing.assert_close(part.positions, path.positions[..., 0], rtol=0, atol=1e-11)
+    start = torch.stack((part.states[:, 0, 0], part.states[:, 0, 1]), dim=-1)
+    path = SlidingBlock(0.7, 0.3, 0.02, form=form).rollout(start, part.drive.force)
+    torch.testing.assert_close(part.states[..., 1], path.velocities[..., 0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(part.states[..., 0], path.positions[..., 0], rtol=0, atol=1e-11)
 
 
 def test_a_seed_fixes_the_recordings_and_another_changes_them():
@@ -53,34 +59,34 @@ def test_a_seed_fixes_the_recordings_and_another_changes_them():
 
 def test_the_size_of_the_training_set_does_not_change_the_test_sets():
     small, large = simulate_sliding_block(trajectories=5, length=10), simulate_sliding_block(trajectories=50)
-    assert torch.equal(small.test.velocities, large.test.velocities)
-    assert torch.equal(small.test_long.velocities, large.test_long.velocities)
+    assert torch.equal(small.test.states[..., 1], large.test.states[..., 1])
+    assert torch.equal(small.test_long.states[..., 1], large.test_long.states[..., 1])
 
 
 def test_measurement_noise_is_on_velocities_to_learn_from_only():
     """The tests are free of noise."""
     data = simulate_sliding_block(trajectories=200, noise=0.05)
-    error = data.train.velocities - data.train.true_velocities
+    error = data.train.states[..., 1] - data.train.true_states[..., 1]
     assert error.std().item() == pytest.approx(0.05, rel=0.03)
-    assert (data.validation.velocities != data.validation.true_velocities).any()
+    assert (data.validation.states[..., 1] != data.validation.true_states[..., 1]).any()
     for part in (data.test, data.test_long):
-        assert torch.equal(part.velocities, part.true_velocities)
-    moved = DT * data.train.true_velocities[:, 1:].cumsum(dim=1)
-    torch.testing.assert_close(data.train.positions[:, 1:], moved, rtol=0, atol=1e-12)
+        assert torch.equal(part.states[..., 1], part.true_states[..., 1])
+    moved = DT * data.train.true_states[:, 1:, 1].cumsum(dim=1)
+    torch.testing.assert_close(data.train.states[:, 1:, 0], moved, rtol=0, atol=1e-12)
 
 
 def test_the_force_keeps_its_level_until_it_switches():
     """Switch probability 0.1, standard deviation 1.2 mu m g, 5 % jitter."""
-    forces = simulate_sliding_block(trajectories=400, length=200, jitter=0.0).train.forces
+    forces = simulate_sliding_block(trajectories=400, length=200, jitter=0.0).train.drive.force[..., 0]
     assert (forces.diff(dim=1) != 0).double().mean().item() == pytest.approx(0.1, abs=0.005)
     assert forces.std().item() == pytest.approx(1.2 * LIMIT, rel=0.03)
-    forces = simulate_sliding_block(trajectories=400, switch_probability=0.0).train.forces
+    forces = simulate_sliding_block(trajectories=400, switch_probability=0.0).train.drive.force[..., 0]
     assert forces.std(dim=1).mean().item() == pytest.approx(0.05 * 1.2 * LIMIT, rel=0.03)
 
 
 def test_the_asked_share_of_trajectories_starts_at_rest():
     for share in (0.0, 0.3, 1.0):
-        start = simulate_sliding_block(share_from_rest=share).train.velocities[:, 0]
+        start = simulate_sliding_block(share_from_rest=share).train.states[:, 0, 1]
         assert (start == 0).double().mean().item() == pytest.approx(share)
 
 
@@ -102,14 +108,14 @@ def labelled() -> dict[str, tuple[torch.Tensor, ...]]:
     result = {}
     for kind in kinds:
         part = simulate_sliding_block(friction=kind).test
-        after = part.velocities[:, 1:]
+        after = part.states[:, 1:, 1]
         pair = torch.stack((torch.relu(after), torch.relu(-after)), dim=-1)
-        result[kind] = (part.velocities[:, :-1], part.forces, pair, part.friction)
+        result[kind] = (part.states[:, :-1, 1], part.drive.force[..., 0], pair, part.drive.friction)
     return result
 
 
 def affine_residual(labels: tuple[torch.Tensor, ...], slack: bool) -> float:
-    """Residual of the true system of 3.1.1, or of 3.1.2 with slack friction [m/s]."""
+    """Residual of the true affine law of `Direct`, or of `Slack` with slack friction [m/s]."""
     velocity, force, pair, friction = labels
     p = velocity + force * DT / MASS
     free = torch.stack((p, -p), dim=-1)
@@ -118,7 +124,6 @@ def affine_residual(labels: tuple[torch.Tensor, ...], slack: bool) -> float:
 
 
 def test_lcp_and_slack_labels_fit_the_affine_laws_and_measurable_ones_do_not(labelled):
-    """Errata 16 and 20."""
     assert affine_residual(labelled["lcp"], slack=False) <= 1e-13
     assert affine_residual(labelled["slack"], slack=True) <= 1e-13
     assert affine_residual(labelled["physical"], slack=False) >= 0.1
@@ -126,7 +131,7 @@ def test_lcp_and_slack_labels_fit_the_affine_laws_and_measurable_ones_do_not(lab
 
 
 def test_physical_and_slack_labels_are_complementary_to_velocity_and_lcp_labels_are_not(labelled):
-    """Errata 16 and 20; a label is 0 up to rounding of the velocity change."""
+    """A label is 0 up to rounding of the velocity change."""
     for kind in ("physical", "slack"):
         _, _, pair, friction = labelled[kind]
         assert (friction >= 0).all()
@@ -154,12 +159,12 @@ def test_labels_do_not_depend_on_the_form_of_the_block():
 def test_falling_recordings_are_rollouts_of_the_scene_that_never_penetrate():
     data = simulate_falling_block(noise=0.01)
     part = data.train
-    start = torch.stack((part.positions[:, 0], part.true_velocities[:, 0]), dim=-1)
-    path = FallingBlock(data.mass, data.dt).rollout(start, part.forces.unsqueeze(-1))
-    assert torch.equal(part.true_velocities, path.velocities[..., 0])
-    assert torch.equal(part.positions, path.positions[..., 0])
-    assert part.positions.min() == 0
-    assert (data.kind, data.mu) == ("falling_block", None)
+    start = torch.stack((part.states[:, 0, 0], part.true_states[:, 0, 1]), dim=-1)
+    path = FallingBlock(data.truth["mass"], data.dt).rollout(start, part.drive.force)
+    assert torch.equal(part.true_states[..., 1], path.velocities[..., 0])
+    assert torch.equal(part.states[..., 0], path.positions[..., 0])
+    assert part.states[..., 0].min() == 0
+    assert (data.name, data.truth) == ("falling_block", {"mass": 1.0})
 
 
 @pytest.mark.parametrize(

@@ -5,20 +5,20 @@ import collections
 import pytest
 import torch
 
-from lcplearn.datasets import Recordings, WindowLoader, windows
-from lcplearn.formulations.losses import Windows
+from lcplearn.datasets import Recordings, WindowLoader, Windows, windows
+from lcplearn.scenes import Drive
 
 
 def ragged(steps: list[int]) -> Recordings:
-    """Recording n has velocity 100 n + k at instant k and force 100 n + k in step k; padding is -1."""
-    horizon = max(steps)
+    """Recording n has velocity 100 n + k at instant k and force 100 n + k in step k; padding is NaN."""
+    horizon, nan = max(steps), float("nan")
     lengths = torch.tensor(steps)[:, None]
     instants = torch.arange(horizon + 1)
     value = 100.0 * torch.arange(len(steps))[:, None] + instants
-    velocities = torch.where(instants <= lengths, value, -1.0)
-    forces = torch.where(instants[:-1] < lengths, value[:, :-1], -1.0)
-    friction = torch.stack((forces, -forces), dim=-1)
-    return Recordings(velocities, velocities, forces, friction, lengths[:, 0], None)
+    velocities = torch.where(instants <= lengths, value, nan)
+    forces = torch.where(instants[:-1] < lengths, value[:, :-1], nan)
+    states = torch.stack((-velocities, velocities), dim=-1)
+    return Recordings(states, Drive(forces[..., None], torch.stack((forces, -forces), dim=-1)), lengths[:, 0])
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
@@ -26,26 +26,30 @@ def test_windows_are_all_stretches_of_k_steps_and_no_padding(k):
     steps = [4, 6, 5]
     cut = windows(ragged(steps), k)
     starts = [100.0 * n + s for n, length in enumerate(steps) for s in range(length - k + 1)]
-    assert cut.velocity[:, 0].tolist() == starts
+    assert cut.states[:, 0, 1].tolist() == starts
     assert cut.valid.all()
-    assert torch.equal(cut.velocity, torch.tensor(starts)[:, None] + torch.arange(k + 1))
-    assert torch.equal(cut.force, cut.velocity[:, :-1])
-    assert torch.equal(cut.friction, torch.stack((cut.force, -cut.force), dim=-1))
+    assert torch.equal(cut.states[..., 1], torch.tensor(starts)[:, None] + torch.arange(k + 1))
+    assert torch.equal(cut.states[..., 0], -cut.states[..., 1])
+    assert torch.equal(cut.drive.force, cut.states[:, :-1, 1:])
+    assert torch.equal(cut.drive.friction, torch.cat((cut.drive.force, -cut.drive.force), dim=-1))
 
 
 def test_a_recording_shorter_than_a_window_is_masked_after_its_end():
     cut = windows(ragged([2, 5]), 4)
     assert cut.valid.tolist() == [[True, True, False, False], [True] * 4, [True] * 4]
-    assert cut.velocity[0, :3].tolist() == [0, 1, 2]
+    assert cut.states[0, :, 1].tolist() == [0, 1, 2, 2, 2]  # the last state goes on, without force
+    assert cut.drive.force[0, :, 0].tolist() == [0, 1, 0, 0]
+    assert bool(cut.drive.friction.isfinite().all())
     assert windows(ragged([2, 3]), 7).valid.sum(dim=1).tolist() == [2, 3]
 
 
 def test_whole_recordings_are_the_longest_windows():
     data = ragged([2, 5, 3])
     cut = windows(data)
-    assert torch.equal(cut.velocity, data.velocities)
+    known = ~data.states.isnan()
+    assert torch.equal(cut.states[known], data.states[known])
     assert cut.valid.sum(dim=1).tolist() == [2, 5, 3]
-    assert windows(data._replace(friction=None)).friction is None
+    assert windows(data._replace(drive=Drive(data.drive.force))).drive.friction is None
 
 
 def test_a_window_needs_a_step():
@@ -55,11 +59,12 @@ def test_a_window_needs_a_step():
 
 def numbered(count: int) -> Windows:
     number = torch.arange(float(count))[:, None]
-    return Windows(number.expand(-1, 2), number, None, torch.ones(count, 1, dtype=torch.bool))
+    states = number[..., None].expand(-1, 2, 2)
+    return Windows(states, Drive(number[..., None]), torch.ones(count, 1, dtype=torch.bool))
 
 
 def drawn(loader: WindowLoader) -> list[list[int]]:
-    return [batch.velocity[:, 0].int().tolist() for batch in loader]
+    return [batch.states[:, 0, 0].int().tolist() for batch in loader]
 
 
 @pytest.mark.parametrize("world_size", [1, 2, 3, 5])
@@ -84,9 +89,9 @@ def test_ranks_get_equal_batches_that_together_cover_everything(world_size, batc
 def test_fields_of_a_batch_belong_together():
     data = windows(ragged([4, 6, 5]), 2)
     for batch in WindowLoader(data, batch_size=4):
-        assert torch.equal(batch.velocity[:, :-1], batch.force)
-        assert torch.equal(batch.friction[..., 0], batch.force)
-        assert batch.valid.shape == batch.force.shape
+        assert torch.equal(batch.states[:, :-1, 1:], batch.drive.force)
+        assert torch.equal(batch.drive.friction[..., :1], batch.drive.force)
+        assert batch.valid.shape == batch.drive.force.shape[:2]
 
 
 def test_the_order_depends_on_seed_and_epoch_and_nothing_else():

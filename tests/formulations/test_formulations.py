@@ -20,7 +20,7 @@ from lcplearn.formulations import (
     Structured,
     Traditional,
 )
-from lcplearn.scenes import Mode
+from lcplearn.scenes import Drive, Mode
 
 DT, MU, MASS, GRAVITY = 0.05, 0.4, 1.5, 9.81
 LIMIT = MU * GRAVITY * DT
@@ -36,8 +36,14 @@ def _seed() -> None:
 def steps(friction: str | None = None) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
     """Velocity, force, friction labels and true next velocity of 2000 simulated steps; 40 % stick."""
     data = simulate_sliding_block(seed=3, friction=friction, dt=DT, mu=MU, mass=MASS).train
-    labels = None if data.friction is None else data.friction.reshape(-1, 2)
-    return data.velocities[:, :-1].reshape(-1), data.forces.reshape(-1), labels, data.velocities[:, 1:].reshape(-1)
+    labels = None if data.drive.friction is None else data.drive.friction.reshape(-1, 2)
+    velocity = data.states[..., 1]
+    return velocity[:, :-1].reshape(-1), data.drive.force.reshape(-1), labels, velocity[:, 1:].reshape(-1)
+
+
+def after_a_step(model: Formulation, velocity: Tensor, force: Tensor, friction: Tensor | None = None) -> Tensor:
+    state = torch.stack((torch.zeros_like(velocity), velocity), dim=-1)
+    return model.advance(state, Drive(force[..., None], friction)).state[..., 1]
 
 
 def with_values(model: Formulation, **values: Tensor | float) -> Formulation:
@@ -79,20 +85,20 @@ def true_traditional() -> Formulation:
 )
 def test_at_the_true_parameters_a_step_is_the_closed_form(model) -> None:
     velocity, force, _, after = steps()
-    error = model().next_velocity(velocity, force) - after
+    error = after_a_step(model(), velocity, force) - after
     assert error.abs().max() <= 1e-13
 
 
 @pytest.mark.parametrize("model", [true_slack, true_relu, true_structured, true_physical])
 def test_a_model_with_structure_sticks_exactly_where_the_truth_does(model) -> None:
     velocity, force, _, after = steps()
-    predicted = model().next_velocity(velocity, force)
+    predicted = after_a_step(model(), velocity, force)
     assert bool((after == 0).any())
     assert torch.equal(predicted == 0, after == 0)
 
 
 def test_direct_is_exact_with_lcp_friction_but_not_with_physical_friction() -> None:
-    """Errata 16: physical friction is complementary to the velocity, but the affine law misses the truth."""
+    """Physical friction is complementary to the velocity, but the affine law misses the truth."""
     velocity, force, labels, after = steps("lcp")
     model = true_direct()
     parts = torch.stack((after.clamp(min=0), (-after).clamp(min=0)), dim=-1)
@@ -101,7 +107,7 @@ def test_direct_is_exact_with_lcp_friction_but_not_with_physical_friction() -> N
     assert (physical * parts).abs().max() <= 1e-12
     assert (labels * parts).abs().max() > 1.0
     assert (model.velocity_parts(velocity, force, physical) - parts).abs().max() > 0.1
-    # Remark 4: rectified, the affine law is exact for both.
+    # Rectified, the affine law is exact for both.
     for friction in (labels, physical):
         rectified = model.velocity_parts(velocity, force, friction).clamp(min=0)
         assert (rectified - parts).abs().max() <= 1e-13
@@ -113,8 +119,8 @@ def test_slack_friction_fits_the_affine_law_and_is_what_the_deployed_lcp_finds()
     parts = torch.stack((after.clamp(min=0), (-after).clamp(min=0)), dim=-1)
     assert (model.velocity_parts(velocity, force, labels) - parts).abs().max() <= 1e-13
     assert (labels * parts).abs().max() <= 1e-12
-    model.next_velocity(velocity, force)
-    assert (model.last_solution.z / DT - labels).abs().max() <= 1e-10
+    solution = model.predict(velocity, force)[1]
+    assert (solution.z / DT - labels).abs().max() <= 1e-10
 
 
 def sticking_samples(count: int = 2000) -> tuple[Tensor, Tensor]:
@@ -137,7 +143,7 @@ def test_sticking_survives_noise_on_the_parameters_of_a_structured_model(model, 
     """NOTES 6: noise on (a, b, c) leaves exact zeros, up to the few samples that it moves over the limit."""
     shares = []
     for _ in range(10):
-        predicted = disturbed(model(), scale).next_velocity(*sticking_samples(200))
+        predicted = after_a_step(disturbed(model(), scale), *sticking_samples(200))
         shares.append((predicted.abs() < 1e-12).double().mean())
     assert torch.stack(shares).mean() >= 0.99
 
@@ -165,8 +171,8 @@ def test_the_threshold_at_small_temperature_tends_to_the_lcp() -> None:
     exact = model.next_velocity(velocity, force)
     errors = []
     for temperature in (1e-2, 1e-3, 1e-4):
-        model.temperature = temperature
-        error = (model.next_velocity(velocity, force) - exact).abs().max().item()
+        with model.softened(temperature):
+            error = (model.next_velocity(velocity, force) - exact).abs().max().item()
         assert error <= temperature * math.log(2)
         errors.append(error)
     assert errors == sorted(errors, reverse=True)
@@ -177,10 +183,11 @@ def test_temperature_gives_friction_a_gradient_on_the_plateau() -> None:
     velocity, force = sticking_samples()
     model = Physical(dt=DT, initial_mu=10.0)
     for temperature, moves in ((0.0, False), (1.0, True)):
-        model.temperature = temperature
         model.zero_grad()
-        (model.next_velocity(velocity, force) - 1.0).square().sum().backward()
-        assert (abs(model.log_mu.grad.item()) > 1e-6) == moves
+        with model.softened(temperature):
+            (after_a_step(model, velocity, force) - 1.0).square().sum().backward()
+        assert (abs(model.free["mu"].grad.item()) > 1e-6) == moves
+    assert model.temperature == 0.0
 
 
 def test_physical_parameters_read_out_what_went_in() -> None:
@@ -196,11 +203,13 @@ def test_physical_parameters_read_out_what_went_in() -> None:
 
 def test_positive_quantities_stay_positive_whatever_the_parameters_are() -> None:
     velocity = torch.linspace(-2, 2, 9, dtype=torch.float64)
-    for model in (Structured(dt=DT), Structured(dt=DT, c_network=True), Physical(dt=DT)):
+    physical = Physical(dt=DT)
+    for model in (Structured(dt=DT), Structured(dt=DT, c_network=True)):
         for _ in range(20):
             disturbed(model, 1.0)
             assert bool((model.velocity_limit(velocity) > 0).all())
             assert model.inverse_mass() > 0
+            assert all(value > 0 for value in disturbed(physical, 1.0).physical_parameters().values())
 
 
 @pytest.mark.parametrize("model", [PSD, PSDSkew])
@@ -210,12 +219,11 @@ def test_positive_semidefinite_matrices_make_every_lcp_solvable(model) -> None:
         free = disturbed(model(dt=DT, initial_noise=0.5), 0.5)
         symmetric = (free.matrix() + free.matrix().mT) / 2
         assert torch.linalg.eigvalsh(symmetric).min() >= 0.9 * free.shift
-        free.next_velocity(velocity[:100], force[:100])
-        assert bool(free.last_solution.solved.all())
+        assert bool(free.predict(velocity[:100], force[:100])[1].solved.all())
 
 
 def test_psd_skew_can_express_the_friction_matrix_and_psd_cannot() -> None:
-    """Errata 25: the friction matrix is positive semidefinite but not symmetric."""
+    """The friction matrix is positive semidefinite but not symmetric."""
     friction = torch.tensor([[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]], dtype=torch.float64)
     exact = PSDSkew(dt=DT, initial_noise=0.0, shift=1e-12)
     assert (exact.matrix() - friction).abs().max() <= 1e-11
@@ -243,8 +251,7 @@ def test_a_batch_is_its_elements_one_by_one_and_a_rollout_its_steps(name: str) -
 
 def test_the_mode_of_a_step_is_stick_exactly_where_the_velocity_is_zero() -> None:
     data = simulate_sliding_block(seed=1).train
-    state = torch.stack((data.positions[:, 0], data.velocities[:, 0]), dim=-1)
-    path = true_physical().rollout(state, data.forces[..., None])
+    path = true_physical().rollout(data.states[:, 0], data.drive.force)
     assert torch.equal(path.mode[..., 0] == Mode.STICK, path.velocities[:, 1:, 0] == 0)
     assert bool((path.mode == Mode.STICK).any())
     assert bool((path.mode == Mode.SLIP).any())
@@ -263,12 +270,14 @@ def test_every_parameter_is_float64_and_seeded_by_the_global_generator(name: str
 @pytest.mark.parametrize("name", FORMULATIONS)
 def test_a_model_is_rebuilt_from_its_arguments_and_parameters(name: str) -> None:
     velocity, force, _, _ = steps()
-    model = copy.deepcopy(FORMULATIONS[name](dt=DT, gravity=9.8))
+    given = {} if name in ("affine", "mlp") else {"gravity": 9.8}
+    model = copy.deepcopy(FORMULATIONS[name](dt=DT, **given))
     torch.manual_seed(1)
     again = type(model)(**model.arguments)
     again.load_state_dict(model.state_dict())
     friction = torch.ones(2000, 2, dtype=torch.float64) if model.needs_friction else None
-    assert torch.equal(again.next_velocity(velocity, force, friction), model.next_velocity(velocity, force, friction))
+    ours, theirs = (after_a_step(m, velocity, force, friction) for m in (model, again))
+    assert torch.equal(ours, theirs)
 
 
 def test_the_registry_names_every_model_of_the_comparison() -> None:
@@ -303,7 +312,6 @@ def test_wrong_arguments_are_refused_by_name() -> None:
 def test_the_lcp_of_a_structured_model_has_only_the_two_rows_that_it_needs() -> None:
     velocity, force, _, _ = steps()
     model = true_structured()
-    model.next_velocity(velocity, force)
-    assert model.last_solution.z.shape == (2000, 2)
-    assert bool(model.last_solution.solved.all())
-    assert not model.last_solution.z.requires_grad
+    solution = model.predict(velocity, force)[1]
+    assert solution.z.shape == (2000, 2)
+    assert bool(solution.solved.all())

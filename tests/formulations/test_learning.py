@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lcplearn.datasets import simulate_sliding_block, windows
-from lcplearn.formulations import FORMULATIONS, Formulation, Windows, loss_terms
+from lcplearn.datasets import Windows, simulate_sliding_block, windows
+from lcplearn.formulations import FORMULATIONS, Formulation, loss_terms
+from lcplearn.scenes import Drive
 
 DT = 0.05
 
@@ -44,10 +45,9 @@ def learned(name: str, noise: float, seed: int = 0, **options: float) -> tuple[F
     torch.manual_seed(seed)
     model = FORMULATIONS[name](dt=DT, **options)
     learn(model, windows(data.train, 1), {"prediction": 1.0})
-    velocity = data.test.velocities
     with torch.no_grad():
-        predicted = model.next_velocity(velocity[:, :-1], data.test.forces)
-    return model, predicted, velocity[:, 1:]
+        predicted = model.advance(data.test.states[:, :-1], Drive(data.test.drive.force)).state[..., 1]
+    return model, predicted, data.test.states[:, 1:, 1]
 
 
 def rmse(predicted: Tensor, truth: Tensor) -> float:
@@ -80,8 +80,8 @@ def test_rectified_outputs_that_start_mirrored_do_not_die(seed: int) -> None:
     torch.manual_seed(seed)
     model = FORMULATIONS["relu"](dt=DT)
     learn(model, windows(data.train, 1), {"prediction": 1.0})
-    velocity = data.test.velocities
-    assert rmse(model.next_velocity(velocity[:, :-1], data.test.forces), velocity[:, 1:]) <= 1e-4
+    predicted = model.advance(data.test.states[:, :-1], data.test.drive).state
+    assert rmse(predicted[..., 1], data.test.states[:, 1:, 1]) <= 1e-4
 
 
 def test_an_affine_model_never_sticks() -> None:

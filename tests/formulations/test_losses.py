@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lcplearn.formulations import FORMULATIONS, LOSS_TERMS, Direct, Formulation, Physical, Windows, loss_terms
-from lcplearn.formulations.losses import VIOLATION_WIDTH, violation
+from lcplearn.datasets import Windows
+from lcplearn.formulations import FORMULATIONS, Direct, Formulation, Physical, loss_terms
+from lcplearn.scenes import Drive
+from lcplearn.scenes.violation import VIOLATION_WIDTH, violation
 
 DT, GRAVITY = 0.1, 10.0
 MODELS_OF = {
@@ -19,21 +21,30 @@ MODELS_OF = {
 }
 
 
+LOSS_TERMS = tuple(MODELS_OF)
+
+
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
 
 
 def build(name: str) -> Formulation:
-    return FORMULATIONS[name](dt=DT, gravity=GRAVITY)
+    given = {} if name in ("affine", "mlp") else {"gravity": GRAVITY}
+    return FORMULATIONS[name](dt=DT, **given)
+
+
+def line_windows(velocity: Tensor, force: Tensor, friction: Tensor | None = None) -> Windows:
+    """From velocities [B, k + 1] and forces [B, k]; positions are 0."""
+    states = torch.stack((torch.zeros_like(velocity), velocity), dim=-1)
+    return Windows(states, Drive(force[..., None], friction), torch.ones(force.shape, dtype=torch.bool))
 
 
 def some_windows(count: int = 6, k: int = 3) -> Windows:
-    return Windows(
+    return line_windows(
         velocity=torch.randn(count, k + 1, dtype=torch.float64),
         force=5 * torch.randn(count, k, dtype=torch.float64),
         friction=torch.rand(count, k, 2, dtype=torch.float64),
-        valid=torch.ones(count, k, dtype=torch.bool),
     )
 
 
@@ -60,23 +71,18 @@ def test_wrong_weights_are_refused() -> None:
         ({"prediction": -1.0}, "prediction.*-1"),
         ({"prediction": float("nan")}, "prediction"),
         ({"predict": 1.0}, "predict"),
-        ({"prediction": 0.0}, "positive"),
+        ({"prediction": 0.0}, "positive weight"),
     ):
         with pytest.raises(ValueError, match=message):
             loss_terms(build("affine"), some_windows(), weights)
     with pytest.raises(ValueError, match="friction"):
-        loss_terms(build("slack"), some_windows()._replace(friction=None), {"prediction": 1.0})
+        loss_terms(build("slack"), line_windows(torch.zeros(1, 2), torch.zeros(1, 1)), {"prediction": 1.0})
 
 
 def test_prediction_and_rollout_equal_values_worked_out_by_hand() -> None:
     """mu g dt = 0.4 m/s and m = 2 kg: from 1 m/s under 4 N, v' = 1 + 0.2 - 0.4 = 0.8; then under -10 N, 0 (stick)."""
     model = Physical(dt=DT, gravity=GRAVITY, initial_mu=0.4, initial_mass=2.0)
-    windows = Windows(
-        velocity=tensor(1.0, 1.0, 0.5)[None],
-        force=tensor(4.0, -10.0)[None],
-        friction=None,
-        valid=torch.ones(1, 2, dtype=torch.bool),
-    )
+    windows = line_windows(tensor(1.0, 1.0, 0.5)[None], tensor(4.0, -10.0)[None])
     terms = loss_terms(model, windows, {"prediction": 1.0, "rollout": 1.0})
     assert terms["prediction"].item() == pytest.approx(0.2**2)
     assert terms["rollout"].item() == pytest.approx((0.2**2 + 0.5**2) / 2)
@@ -85,7 +91,7 @@ def test_prediction_and_rollout_equal_values_worked_out_by_hand() -> None:
 def test_penalties_equal_values_worked_out_by_hand() -> None:
     """Without G the parts are (p, -p) with p = v + u dt = 0.5: the second is negative by 0.5."""
     model = Direct(dt=DT, gravity=GRAVITY)
-    windows = Windows(tensor(1.0, 0.4)[None], tensor(-5.0)[None], tensor(2.0, 3.0)[None, None], torch.tensor([[True]]))
+    windows = line_windows(tensor(1.0, 0.4)[None], tensor(-5.0)[None], tensor(2.0, 3.0)[None, None])
     weights = {"prediction": 1.0, "complementarity": 1.0, "nonnegativity": 1.0}
     terms = loss_terms(model, windows, weights)
     assert terms["prediction"].item() == pytest.approx((0.5 - 0.4) ** 2 + 0.5**2)
@@ -99,12 +105,11 @@ def test_padding_changes_neither_values_nor_gradients(name: str) -> None:
     weights = {term: 1.0 for term in LOSS_TERMS if name in MODELS_OF[term]}
     valid = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
     results = []
-    for padding in (0.5, float("nan"), float("inf")):
-        after = torch.where(valid, windows.velocity[:, 1:], padding)
+    for padding in (0.5, -3.0, 1e6):
+        after = torch.where(valid[..., None], windows.states[:, 1:], padding)
         padded = Windows(
-            velocity=torch.cat((windows.velocity[:, :1], after), dim=1),
-            force=torch.where(valid, windows.force, padding),
-            friction=torch.where(valid[..., None], windows.friction, padding),
+            states=torch.cat((windows.states[:, :1], after), dim=1),
+            drive=windows.drive.map(lambda values, padding=padding: torch.where(valid[..., None], values, padding)),
             valid=valid,
         )
         model.zero_grad()
@@ -114,7 +119,7 @@ def test_padding_changes_neither_values_nor_gradients(name: str) -> None:
     assert all(bool(torch.isfinite(x).all()) for x in results[0])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-    one_step = Windows(windows.velocity[:3, :2], *(x[:3, :1] for x in windows[1:]))
+    one_step = Windows(windows.states[:3, :2], windows.drive.map(lambda x: x[:3, :1]), windows.valid[:3, :1])
     first = loss_terms(model, one_step, weights)
     for term in set(weights) - {"rollout"}:
         assert terms[term].item() == pytest.approx(first[term].item(), rel=1e-12)
@@ -171,11 +176,11 @@ def test_the_violation_loss_vanishes_on_fast_true_steps_and_on_sticks() -> None:
 
 def test_the_violation_loss_has_a_gradient_where_prediction_has_none() -> None:
     """With mu far too high all samples are predicted to stick, and the prediction loss is flat in mu."""
-    windows = Windows(tensor(0.0, 0.5)[None], tensor(20.0)[None], None, torch.tensor([[True]]))
+    windows = line_windows(tensor(0.0, 0.5)[None], tensor(20.0)[None])
     model = Physical(dt=DT, gravity=GRAVITY, initial_mu=5.0)
     gradients = {}
     for term in ("prediction", "violation"):
-        (gradient,) = torch.autograd.grad(loss_terms(model, windows, {term: 1.0})[term], model.log_mu)
+        (gradient,) = torch.autograd.grad(loss_terms(model, windows, {term: 1.0})[term], model.free["mu"])
         gradients[term] = gradient.item()
     assert gradients["prediction"] == 0.0
     assert gradients["violation"] > 0.0

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lcplearn.scenes import BouncingBlock, FallingBlock, OneWayBlock, SlidingBlock, rollout
+from lcplearn.scenes import BouncingBlock, Drive, FallingBlock, OneWayBlock, SlidingBlock, rollout
 
 SCENES = [
     FallingBlock(1.5, 0.05),
@@ -46,4 +46,4 @@ def test_a_wrong_shape_is_named():
     with pytest.raises(ValueError, match=r"^forces: expected shape .* got \[0, 1\]"):
         scene.rollout(torch.zeros(2), torch.zeros(0, 1))
     with pytest.raises(ValueError, match=r"^state: expected shape .* got \[1\]"):
-        rollout(scene.advance, torch.zeros(1), torch.zeros(5, 1))
+        rollout(scene, torch.zeros(1), Drive(torch.zeros(5, 1)))

@@ -73,7 +73,7 @@ def test_the_velocities_become_complementary_even_after_ones_that_were_not(plus,
 def test_the_lemma_fails_for_a_negative_friction_coefficient():
     """Errata 12: with |p| < -c both velocities are positive."""
     zero = torch.zeros((), dtype=torch.float64)
-    z = solve_lcp(*block(mu=-0.4).lcp(zero, zero), method="diagonal").z
+    z = solve_lcp(*block(mu=torch.tensor(-0.4, dtype=torch.float64)).lcp(zero, zero), method="diagonal").z
     assert (z > 0).all()
 
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lcplearn.datasets import BlockData, simulate_sliding_block
+from lcplearn.datasets import Task, simulate_sliding_block
 from lcplearn.training import Optimizer, Result, fit
 
 ROOT = Path(__file__).parents[2]
@@ -14,17 +14,17 @@ QUIET = {"enable_progress_bar": False}
 SMALL = ["data.trajectories=4", "data.length=30", "+data.long_length=20", "trainer.check_val_every_n_epoch=1"]
 
 
-def small_data(**arguments: Any) -> BlockData:
+def small_data(**arguments: Any) -> Task:
     sizes = {"trajectories": 4, "length": 30, "validation_trajectories": 2, "test_trajectories": 3, "test_length": 100,
              "long_trajectories": 2, "long_length": 1000}  # fmt: skip
     return simulate_sliding_block(**(sizes | arguments))
 
 
-def tiny_data(**arguments: Any) -> BlockData:
+def tiny_data(**arguments: Any) -> Task:
     return small_data(test_length=20, long_length=20, **arguments)
 
 
-def short_fit(model: Any, data: BlockData, folder: Path, **arguments: Any) -> Result:
+def short_fit(model: Any, data: Task, folder: Path, **arguments: Any) -> Result:
     chosen: dict[str, Any] = {"epochs": 4, "optimizer": Optimizer(lbfgs_after=2, lbfgs_iterations=3)}
     chosen |= {"trainer": QUIET | {"check_val_every_n_epoch": 1}} | arguments
     return fit(model, data, folder=folder, **chosen)

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from lcplearn import compare
-from lcplearn.training.metrics import KEYS
+from lcplearn.training.figures_of_merit import KEYS
 
 
 def run(folder: Path, target: str, config: dict[str, Any] | None = None, **figures: float | None) -> None:

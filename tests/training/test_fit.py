@@ -14,10 +14,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from training.helpers import QUIET, short_fit, small_data, tiny_data
 from training.kill import kill_once
 
-from lcplearn.datasets import BlockData, windows
+from lcplearn.datasets import Task, windows
 from lcplearn.formulations import FORMULATIONS, MLP, Affine, Formulation, Physical, Structured, loss_terms
 from lcplearn.training import Optimizer, TrainingDivergedError, TrainingInterrupted, figures, fit, load
-from lcplearn.training.metrics import KEYS, UNITS, evaluate, format_table
+from lcplearn.training.figures_of_merit import KEYS
+from lcplearn.training.metrics import Predictions, evaluate, format_table
 from lcplearn.training.writing import replace, write_figures
 
 FRICTION = {"direct": "physical", "slack": "slack"}
@@ -49,10 +50,9 @@ def test_a_run_leaves_figures_checkpoints_settings_and_pictures(tmp_path: Path) 
     assert names >= {"best.ckpt", "last.ckpt", "metrics.json", "config.yaml"}
     assert names >= {"one_step_map.png", "rollouts.png", "error_over_horizon.png"}
     metrics = json.loads((result.folder / "metrics.json").read_text())
-    assert tuple(metrics) == KEYS
+    assert tuple(metrics) == (*KEYS, "mass")  # and what was learned
     assert metrics["rest_share"] is None  # slides only
     assert metrics["rollout_rmse_100"] is not None
-    assert set(UNITS) == set(KEYS)
     assert all(key in format_table(metrics) for key in KEYS if metrics[key] is not None)
 
 
@@ -72,8 +72,7 @@ def test_every_model_comes_back_from_its_checkpoint_with_default_loading(name: s
     loaded = load(tmp_path / "best.ckpt", map_location="cpu")
     assert type(loaded) is type(model)
     test = data.test
-    friction = None if test.friction is None else test.friction[:, 0]
-    ours, theirs = (m.next_velocity(test.velocities[:, 0], test.forces[:, 0], friction) for m in (model, loaded))
+    ours, theirs = (m.advance(test.states[:, 0], test.drive.at(0)).state for m in (model, loaded))
     assert torch.equal(ours, theirs)
 
 
@@ -99,8 +98,8 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
 def test_a_model_of_another_time_step_or_gravity_than_the_data_is_refused(tmp_path: Path) -> None:
     """It would learn, but another mass and friction."""
     data = tiny_data()
-    for model in (Structured(dt=2 * data.dt), Structured(dt=data.dt, gravity=1.62)):
-        with pytest.raises(ValueError, match=r"^model: expected dt = 0\.05 s and gravity = 9\.81"):
+    for model, name in ((Structured(dt=2 * data.dt), "dt"), (Structured(dt=data.dt, gravity=1.62), "gravity")):
+        with pytest.raises(ValueError, match=f"^model: expected {name} = .* as in the data, got"):
             short_fit(model, data, tmp_path / "run")
     with pytest.raises(ValueError, match=r"^epochs: expected at least 1, got 0"):
         short_fit(Structured(dt=data.dt), data, tmp_path / "run", epochs=0)
@@ -212,7 +211,7 @@ def test_resuming_another_training_is_refused_by_name_or_written_down(tmp_path: 
     data, last = tiny_data(), tmp_path / "run" / "last.ckpt"
     short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=2)
     other = tiny_data(noise=0.3)
-    cases: list[tuple[BlockData, dict[str, Any], str]] = [
+    cases: list[tuple[Task, dict[str, Any], str]] = [
         (data, {"seed": 7}, "with seed=0, but the settings say 7: .* add allow_changes=true"),
         (data, {"batch_size": 8}, "with batch_size=None, but the settings say 8"),
         (data, {"optimizer": Optimizer(lr=0.5)}, "with optimizer.lbfgs_after=2, but the settings say None"),
@@ -265,7 +264,7 @@ def test_a_rollout_that_diverges_is_a_word_in_metrics_and_is_drawn_as_far_as_it_
     write_figures(tmp_path / "metrics.json", metrics)
     assert json.loads((tmp_path / "metrics.json").read_text())["rollout_rmse_1000"] == "diverged"
     assert "diverged" in format_table(metrics)
-    for name, figure in figures.draw(model, data).items():
+    for name, figure in figures.draw(Predictions(model, data)).items():
         figure.savefig(tmp_path / f"{name}.png")
 
 

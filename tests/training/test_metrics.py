@@ -1,26 +1,32 @@
 """Figures of merit on recordings whose errors are known by construction, none of them perfect."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
-from lcplearn.datasets import BlockData, Recordings
-from lcplearn.formulations import Formulation, Physical
+from lcplearn.datasets import Recordings, Task
+from lcplearn.formulations import LineFormulation, Physical
+from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
+from lcplearn.scenes import LINE, Drive
 from lcplearn.training.metrics import evaluate, one_step
 
 DT = 0.1
 
 
-class Echo(Formulation):
+class Echo(LineFormulation):
     """The velocity after a step is the force: what a test wants predicted stands in its recordings."""
 
     def __init__(self, *, dt: float = DT, gravity: float = 9.81) -> None:
         super().__init__(dt=dt, gravity=gravity)
         self.unused = torch.nn.Parameter(torch.zeros((), dtype=torch.float64))
 
-    def next_velocity(self, velocity: Tensor, force: Tensor, friction: Tensor | None = None) -> Tensor:
-        return force + 0.0 * velocity
+    def predict(
+        self, velocity: Tensor, force: Tensor, friction: Tensor | None = None
+    ) -> tuple[Tensor, LCPSolution | None]:
+        return force + 0.0 * velocity, None
 
 
 def recordings(predicted: Tensor, true: Tensor, steps: list[int] | None = None, *, real: bool = False) -> Recordings:
@@ -28,11 +34,12 @@ def recordings(predicted: Tensor, true: Tensor, steps: list[int] | None = None, 
     velocities = torch.nn.functional.pad(true, (1, 0))
     positions = torch.nn.functional.pad(DT * true.cumsum(1), (1, 0))
     length = torch.full((len(true),), true.shape[1]) if steps is None else torch.tensor(steps)
-    return Recordings(positions, velocities, predicted, None, length, None if real else velocities)
+    states = torch.stack((positions, velocities), dim=-1)
+    return Recordings(states, Drive(predicted.unsqueeze(-1)), length, None if real else states)
 
 
-def data(test: Recordings, kind: str = "sliding_block", test_long: Recordings | None = None) -> BlockData:
-    return BlockData(kind, test, test, test, test_long, DT, 9.81, None, None)  # type: ignore[arg-type]
+def data(test: Recordings, test_long: Recordings | None = None, **more: Any) -> Task:
+    return Task("echo", LINE, DT, test, test, test, test_long, **more)
 
 
 def tensor(*rows: list[float]) -> Tensor:
@@ -74,7 +81,7 @@ def test_stops_are_judged_by_median_90th_percentile_and_rest_at_each_slides_own_
     predicted[:, 0] += torch.arange(11) * 1e-3 / DT
     predicted[8:, 1] = 1e-9
     predicted[:, 2] = 7.0
-    found = evaluate(Echo(), data(recordings(predicted, true, [2] * 11, real=True), kind="cube_slides"))
+    found = evaluate(Echo(), data(recordings(predicted, true, [2] * 11, real=True), judged_by=("one_step", "stops")))
     assert found["stop_error_median_mm"] == pytest.approx(5.0, abs=1e-4)
     assert found["stop_error_p90_mm"] == pytest.approx(9.0, abs=1e-4)
     assert found["rest_share"] == pytest.approx(8 / 11)
@@ -84,10 +91,10 @@ def test_stops_are_judged_by_median_90th_percentile_and_rest_at_each_slides_own_
 class Unsolvable(Echo):
     """Its LCP has a solution where the force is positive only."""
 
-    def next_velocity(self, velocity: Tensor, force: Tensor, friction: Tensor | None = None) -> Tensor:
-        solution = solve_lcp(torch.zeros(1, 1, dtype=torch.float64), force.reshape(-1, 1))
-        self.last_solution = solution
-        return force + 0.0 * velocity
+    def predict(
+        self, velocity: Tensor, force: Tensor, friction: Tensor | None = None
+    ) -> tuple[Tensor, LCPSolution | None]:
+        return force, solve_lcp(torch.zeros(1, 1, dtype=torch.float64), force.unsqueeze(-1))
 
 
 def test_the_share_of_unsolved_lcps_is_counted() -> None:
@@ -97,7 +104,7 @@ def test_the_share_of_unsolved_lcps_is_counted() -> None:
 
 def test_parameter_errors_are_distances_from_the_truth() -> None:
     test = recordings(tensor([0.0]), tensor([0.0]))
-    known = BlockData("sliding_block", test, test, test, None, DT, 9.81, 1.0, 0.5)
+    known = data(test, truth={"mass": 1.0, "mu": 0.5})
     found = evaluate(Physical(dt=DT, initial_mu=0.25, initial_mass=3.0), known)
     assert found["mu_error"] == pytest.approx(0.25)
     assert found["mass_error"] == pytest.approx(2.0)

@@ -13,6 +13,7 @@ from training.helpers import short_fit, tiny_data
 
 import lcplearn
 from lcplearn import predict
+from lcplearn.datasets import Task
 from lcplearn.datasets.cube_slides import COLUMNS
 from lcplearn.formulations import Direct, Physical, Structured
 from lcplearn.training.metrics import evaluate
@@ -34,6 +35,15 @@ def needs_friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = tiny_data(friction="physical")
     short_fit(Direct(dt=data.dt), data, folder, epochs=1)
     return folder / "best.ckpt"
+
+
+def recorded(data: Task) -> dict[str, np.ndarray]:
+    """The test recordings as a file has them."""
+    test = data.test
+    positions, velocities = data.space.split(test.states)
+    arrays = {"positions": positions, "velocities": velocities, "forces": test.drive.force, "steps": test.steps}
+    arrays["true_velocities"] = data.space.split(test.truth)[1]
+    return {name: value.numpy() for name, value in arrays.items()}
 
 
 def forces_csv(folder: Path, header: str = "time,force", rows: list[str] | None = None) -> Path:
@@ -81,7 +91,7 @@ def test_a_model_of_measured_friction_asks_for_its_columns(needs_friction: Path,
 
 def test_scoring_the_test_recordings_gives_the_figures_of_the_run(checkpoint: Path, tmp_path: Path) -> None:
     data = tiny_data()
-    arrays = {name: value for name, value in data.test._asdict().items() if value is not None}
+    arrays = recorded(data)
     np.savez(tmp_path / "data.npz", dt=data.dt, mu=0.4, mass=1.5, **arrays)
     predict.main([str(checkpoint), "--score", str(tmp_path / "data.npz"), "--output", str(tmp_path / "score.json")])
     score = json.loads((tmp_path / "score.json").read_text())
@@ -142,8 +152,7 @@ def test_an_npz_input_of_another_time_step_is_refused(checkpoint: Path, tmp_path
 
 def test_recordings_are_looked_for_where_train_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tiny_data()
-    arrays = {name: value.numpy() for name, value in data.test._asdict().items() if value is not None}
-    np.savez(tmp_path / "mine.npz", dt=data.dt, **arrays)
+    np.savez(tmp_path / "mine.npz", dt=data.dt, **recorded(data))
     monkeypatch.setenv("LCPLEARN_DATA", str(tmp_path))
     for name in ("mine.npz", "data/mine.npz"):
         assert len(predict.read_data(name, Structured(dt=data.dt)).test.steps) == len(data.test.steps)
@@ -246,7 +255,7 @@ def test_files_that_are_no_checkpoint_or_no_data_get_one_sentence(checkpoint: Pa
         ([str(checkpoint), "--score", "nope.npz"], "nope.npz: no such file"),
         (
             [str(checkpoint), "--input", str(text), "--state", "0", "nan"],
-            "state: expected finite position and velocity",
+            "state: expected finite positions and velocities",
         ),
         ([str(checkpoint), "--input", str(text), "--output", "/proc/none/a.csv"], "^/proc/none: No such file"),
     ]

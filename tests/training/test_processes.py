@@ -10,7 +10,7 @@ import pytest
 from training.helpers import ROOT, SMALL, environment, short_fit, train
 
 import lcplearn
-from lcplearn.datasets import BlockData, simulate_sliding_block
+from lcplearn.datasets import Task, simulate_sliding_block
 from lcplearn.formulations import Physical
 from lcplearn.training import Optimizer
 
@@ -19,12 +19,12 @@ TWO = ["trainer.strategy=ddp", "trainer.devices=2"]
 
 
 @pytest.fixture(scope="module")
-def data() -> BlockData:
+def data() -> Task:
     return simulate_sliding_block(trajectories=4, length=30, long_length=20)
 
 
 @pytest.fixture(scope="module")
-def error(data: BlockData, tmp_path_factory: pytest.TempPathFactory) -> float | None:
+def error(data: Task, tmp_path_factory: pytest.TempPathFactory) -> float | None:
     """Of one process that trains alone."""
     folder = tmp_path_factory.mktemp("alone") / "run"
     result = short_fit(Physical(dt=data.dt), data, folder, epochs=3, optimizer=Optimizer(lbfgs_after=2))
@@ -37,7 +37,7 @@ def noise(text: str) -> list[str]:
 
 
 def test_runs_side_by_side_train_as_one_by_one_end_with_the_comparison_and_resume(
-    tmp_path: Path, data: BlockData, error: float | None
+    tmp_path: Path, data: Task, error: float | None
 ) -> None:
     done = train(tmp_path, "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model=affine,physical", *SHORT)
     assert done.returncode == 0, done.stderr

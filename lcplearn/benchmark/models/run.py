@@ -98,9 +98,9 @@ def markov_row(model: str, part: str, lifted: modes.ModeData, seed: int) -> Row:
     else:
         recordings = simulated(1000, 0.0, seed)
         truth = recordings.test_long
-        if truth is None or truth.true_velocities is None:
+        if truth is None or truth.true_states is None:
             raise ValueError("data: expected long simulated recordings")
-        observed = torch.where(truth.true_velocities[:, 1:] == 0, int(Mode.STICK), int(Mode.SLIP))
+        observed = torch.where(truth.true_states[:, 1:, 1] == 0, int(Mode.STICK), int(Mode.SLIP))
     half = len(observed) // 2
     order = MARKOV[model]
     if order is None:

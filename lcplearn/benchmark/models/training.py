@@ -8,8 +8,8 @@ import torch
 
 from lcplearn.benchmark.harness.study import Row
 from lcplearn.benchmark.models.modes import ModeData, Score, modes_from_forces, score
-from lcplearn.datasets import BlockData, read_cube_slides, simulate_sliding_block
-from lcplearn.formulations import FORMULATIONS, Formulation
+from lcplearn.datasets import Task, read_cube_slides, simulate_sliding_block
+from lcplearn.formulations import FORMULATIONS, Formulation, build
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes import Mode
 from lcplearn.training import Optimizer, fit
@@ -81,7 +81,7 @@ def warm_up() -> None:
     solve_lcp(M, torch.tensor([-1.0, 1.0], dtype=torch.float64), method="pivoting").z.sum().backward()
 
 
-def simulated(steps: int, noise: float, seed: int, friction: Any = None) -> BlockData:
+def simulated(steps: int, noise: float, seed: int, friction: Any = None) -> Task:
     """A sliding block with a wanted number of training steps; a quarter of that on top to validate."""
     length = min(steps, 100)
     trajectories = max(1, steps // 100)
@@ -118,14 +118,14 @@ def train_slides(name: str, slides: int, seed: int) -> Row:
     data = read_cube_slides(seed=seed, training_slides=slides, validation_slides=max(1, slides // 5))
     settings = SLIDES[name]
     arguments = dict(settings.arguments)
-    if name == "physical" and data.mass is not None:
-        arguments["initial_mass"] = data.mass
+    if name == "physical":
+        arguments["initial_mass"] = data.given["mass"]
     return _train(name, settings._replace(arguments=arguments), data, seed)[1]
 
 
-def _train(name: str, settings: Settings, data: BlockData, seed: int) -> tuple[Formulation, Row]:
+def _train(name: str, settings: Settings, data: Task, seed: int) -> tuple[Formulation, Row]:
     torch.manual_seed(seed)
-    model = FORMULATIONS[name.split(",")[0]](dt=data.dt, gravity=data.gravity, **settings.arguments)
+    model = build(FORMULATIONS[name.split(",")[0]], data, **settings.arguments)
     iterations = settings.lbfgs // 10
     optimizer = Optimizer(lr=settings.lr, lbfgs_after=settings.adam if iterations else None)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -148,13 +148,13 @@ def _train(name: str, settings: Settings, data: BlockData, seed: int) -> tuple[F
 
 
 @torch.no_grad()
-def foretell_modes(model: Formulation, data: BlockData) -> Row:
+def foretell_modes(model: Formulation, data: Task) -> Row:
     """Share of stick and slip foretold one step ahead on the test data: exactly at rest, and slower than `NEARLY`."""
-    truth = data.test.true_velocities
+    truth = data.test.true_states
     if truth is None:
         raise ValueError("data: expected simulated recordings, whose modes are known")
-    actual = _two_modes(truth[:, 1:] == 0)
-    velocity = model.next_velocity(truth[:, :-1], data.test.forces, data.test.friction)
+    actual = _two_modes(truth[:, 1:, 1] == 0)
+    velocity = model.advance(truth[:, :-1], data.test.drive).state[..., 1]
     exactly: Score = score(_two_modes(velocity.abs() < 1e-12), actual)
     nearly: Score = score(_two_modes(velocity.abs() < NEARLY), actual)
     return dict(zip(MODE_COLUMNS, (*exactly, *nearly), strict=True))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +12,9 @@ from torch import Tensor
 from lcplearn.benchmark.problems.families import stewart_trinkle
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes import BouncingBlock, FallingBlock, Mode, OneWayBlock, SlidingBlock
-from lcplearn.scenes.rollout import Block
+from lcplearn.scenes.scene import Drive, Moving
+from lcplearn.scenes.scene import Step as SceneStep
+from lcplearn.scenes.space import LINE, Space
 
 MASS, MU, GRAVITY, RESTITUTION = 1.5, 0.4, 9.81, 0.5
 SPEED, HEIGHT, DURATION = 2.0, 1.0, 1.0  # [m/s], [m], [s]: slides 0.51 m to rest in 0.51 s; lands after 0.45 s
@@ -59,16 +61,19 @@ def _stepper(make: Callable[[float], Any]) -> Callable[[float], Step]:
 
 
 @dataclass(frozen=True)
-class _FullBlock(Block):
+class _FullBlock(Moving):
     """A block that the full LCP moves, with what a scene does besides: without it the full LCP would seem faster."""
+
+    space: ClassVar[Space] = LINE
+    contacts: ClassVar[int] = 1
 
     move: Callable[[State, float], State]
     dt: float
 
-    def advance(self, state: State, force: Tensor) -> tuple[Tensor, Tensor]:
+    def advance(self, state: Tensor, drive: Drive) -> SceneStep:
         state = self.move(state, self.dt)
         mode = torch.where(state[..., 1] == 0, int(Mode.STICK), int(Mode.SLIP))
-        return state, mode.unsqueeze(-1)
+        return SceneStep(state, mode.unsqueeze(-1))
 
 
 def _full(move: Callable[[State, float], State]) -> Formulation:

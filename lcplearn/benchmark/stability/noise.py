@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lcplearn.formulations.formulation import STICK_SPEED
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes import SlidingBlock, slide
+from lcplearn.scenes.scene import STICK_SPEED
 
 BLOCK = SlidingBlock(mass=1.0, mu=0.4, dt=1.0)
 LIMIT = 0.4 * 9.81  # [N] largest friction force of BLOCK

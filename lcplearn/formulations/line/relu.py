@@ -1,4 +1,4 @@
-"""ReLU on the decomposed velocities (the notes' Remark 4)."""
+"""ReLU on the decomposed velocities."""
 
 from typing import cast
 
@@ -7,13 +7,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from lcplearn.formulations.formulation import Formulation
+from lcplearn.datasets.recordings import Windows
+from lcplearn.formulations.line.decomposed import decomposed_error
+from lcplearn.formulations.line.formulation import LineFormulation, Prediction, first_step
 from lcplearn.formulations.networks import features, network
 
 INITIAL_BIAS = -0.01  # [m/s] negative: a small stick band from the start, with both outputs alive outside it
 
 
-class ReLU(Formulation):
+class ReLU(LineFormulation):
     """Predict the decomposed velocity by rectified affine maps, or by a rectified network.
 
     v_{k+1} = v+ - v-,   (v+, v-) = relu(W h + bias),   h = (v, u dt) or the last hidden layer of a network
@@ -28,7 +30,7 @@ class ReLU(Formulation):
         width: Units of a hidden layer.
         depth: Hidden layers below the rectified outputs; 0 makes them affine in (v, u dt).
 
-    Source: notes Remark 4; NOTES 6.
+    Source: Pfrommer's "LCP Notes" (2019), Remark 4; NOTES 6.2.
     """
 
     def __init__(self, *, dt: float, gravity: float = 9.81, width: int = 64, depth: int = 0) -> None:
@@ -50,11 +52,15 @@ class ReLU(Formulation):
         """Predict (v+, v-) >= 0 [m/s]."""
         return relu(self.net(features(velocity, force, self.dt)))
 
-    def next_velocity(
+    def predict(
         self,
         velocity: Float[Tensor, "*batch"],
         force: Float[Tensor, "*batch"],
         friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
+    ) -> Prediction:
         parts = self.velocity_parts(velocity, force)
-        return parts[..., 0] - parts[..., 1]
+        return parts[..., 0] - parts[..., 1], None
+
+    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        """Squared error of (v+, v-) after the first step [m^2/s^2]."""
+        return decomposed_error(self.velocity_parts(*first_step(windows)), windows)

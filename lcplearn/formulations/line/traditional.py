@@ -1,18 +1,20 @@
-"""LCP in the loop with free matrices (the notes' 3.1.3): it can slide, but it can't keep a block at rest."""
+"""LCP in the loop with free matrices: it can slide, but it can't keep a block at rest."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lcplearn.formulations.formulation import Formulation
-from lcplearn.formulations.networks import features, positive
+from lcplearn.domains import NOT_NEGATIVE, check, positive
+from lcplearn.formulations.line.formulation import LineFormulation, Prediction
+from lcplearn.formulations.networks import features
+from lcplearn.lcp.solve import solve_lcp
 
-# The friction LCP's [[D D', 1], [-1', 0]], D = (1, -1), in (lambda+ dt, lambda- dt, gamma) and unit mass (errata 22).
+# The friction LCP's [[D D', 1], [-1', 0]], D = (1, -1), in (lambda+ dt, lambda- dt, gamma), unit mass (NOTES 5.6).
 SYMMETRIC = [[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
 SKEW = [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [-1.0, -1.0, 0.0]]
 
 
-class FreeLCP(Formulation):
+class FreeLCP(LineFormulation):
     """Solve a three-row LCP whose matrix and vector are learned, and read the velocity from its impulses.
 
     0 <= (y+, y-, gamma)  ⊥  f(v, u) + G (y+, y-, gamma) >= 0,   v_{k+1} = b(v, u) + a (y+ - y-)
@@ -27,15 +29,14 @@ class FreeLCP(Formulation):
         initial_mu: Friction coefficient at the start; > 0.
         initial_noise: Standard deviation of the noise on the initial entries of f and G; >= 0.
 
-    Source: notes sections 2.5 and 3.1.3; errata 22-26; NOTES 6.
+    Source: Pfrommer's "LCP Notes" (2019), sections 2.5 and 3.1.3; NOTES 6.2.
     """
 
     def __init__(
         self, *, dt: float, gravity: float = 9.81, initial_mu: float = 0.1, initial_noise: float = 0.03
     ) -> None:
         super().__init__(dt=dt, gravity=gravity)
-        if not initial_noise >= 0.0:
-            raise ValueError(f"initial_noise must be at least 0, got {initial_noise}.")
+        check(NOT_NEGATIVE, initial_noise=initial_noise)
         self.initial_noise = initial_noise
         limit = positive("initial_mu", initial_mu) * gravity * dt
         self.f_weight = self.noisy([[1.0, 1.0], [-1.0, -1.0], [0.0, 0.0]])
@@ -53,15 +54,16 @@ class FreeLCP(Formulation):
         """G, from the learned parameters."""
         raise NotImplementedError
 
-    def next_velocity(
+    def predict(
         self,
         velocity: Float[Tensor, "*batch"],
         force: Float[Tensor, "*batch"],
         friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
+    ) -> Prediction:
         inputs = features(velocity, force, self.dt)
-        impulse = self.solve(self.matrix(), inputs @ self.f_weight.mT + self.f_bias).z
-        return inputs @ self.b_weight + self.b_bias + self.a * (impulse[..., 0] - impulse[..., 1])
+        solution = solve_lcp(self.matrix(), inputs @ self.f_weight.mT + self.f_bias)
+        impulse = self.a * (solution.z[..., 0] - solution.z[..., 1])
+        return inputs @ self.b_weight + self.b_bias + impulse, solution
 
 
 class Traditional(FreeLCP):
@@ -80,7 +82,7 @@ class Traditional(FreeLCP):
 class PSD(FreeLCP):
     """Learn G = L L' + shift I, symmetric positive definite: always solvable, but it can't be the friction matrix.
 
-    The friction matrix is positive semidefinite, but not symmetric (errata 25).
+    The friction matrix is positive semidefinite, but not symmetric (NOTES 6.2).
 
     Args:
         dt: Time step [s].

@@ -1,16 +1,20 @@
-"""Velocity affine in measured friction (the notes' 3.1.1), which a prediction therefore needs too."""
+"""Velocity affine in measured friction, which a prediction therefore needs too."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import relu
 
-from lcplearn.formulations.formulation import Formulation
+from lcplearn.datasets.recordings import Windows
+from lcplearn.formulations.line.decomposed import decomposed_error
+from lcplearn.formulations.line.formulation import LineFormulation, Prediction, first_step
 from lcplearn.formulations.networks import features
 
 
-class KnownFriction(Formulation):
+class KnownFriction(LineFormulation):
     """Decompose the next velocity into parts affine in velocity, force and a known friction vector.
 
     (v+, v-) = f(v, u) + G y,   f = F (v, u dt) + f_0,   y = friction * dt
@@ -42,9 +46,28 @@ class KnownFriction(Formulation):
             ValueError: friction is missing.
         """
         if friction is None:
-            name = type(self).__name__
-            raise ValueError(f"{name} needs friction=... (measured friction [N], two per step) and got none.")
+            raise ValueError(
+                f"friction: expected measured friction [N], two a step, for {type(self).__name__}, got none"
+            )
         return self.free_parts(velocity, force) + friction * self.dt @ self.G.mT
+
+    def errors(self) -> dict[str, Callable[[Windows], Tensor]]:
+        """Beside the usual: complementarity (friction * (v+, v-))^2 and nonnegativity max(0, -(v+, v-))^2."""
+        more = {"complementarity": self._complementarity_error, "nonnegativity": self._nonnegativity_error}
+        return super().errors() | more
+
+    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        """Squared error of (v+, v-) after the first step [m^2/s^2]."""
+        return decomposed_error(self.velocity_parts(*first_step(windows)), windows)
+
+    def _complementarity_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        velocity, force, friction = first_step(windows)
+        parts = self.velocity_parts(velocity, force, friction)
+        assert friction is not None  # velocity_parts needs it
+        return (friction * parts).square().sum(-1)
+
+    def _nonnegativity_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        return relu(-self.velocity_parts(*first_step(windows))).square().sum(-1)
 
 
 class Direct(KnownFriction):
@@ -55,16 +78,16 @@ class Direct(KnownFriction):
     Physical labels (the force that acts) are complementary to the velocity but not affine in it, LCP labels (the slack
     variables' fictitious forces) the reverse: no f, G fit the affine system and the complementarity at once.
 
-    Source: notes section 3.1.1; errata 16-19.
+    Source: Pfrommer's "LCP Notes" (2019), section 3.1.1; NOTES 6.2.
     """
 
     needs_friction: ClassVar[bool] = True
 
-    def next_velocity(
+    def predict(
         self,
         velocity: Float[Tensor, "*batch"],
         force: Float[Tensor, "*batch"],
         friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
+    ) -> Prediction:
         parts = self.velocity_parts(velocity, force, friction)
-        return parts[..., 0] - parts[..., 1]
+        return parts[..., 0] - parts[..., 1], None

@@ -1,15 +1,21 @@
 """LCP in the loop with the zeros and ones of the friction problem kept: the models that stick exactly."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from lcplearn.formulations.formulation import Formulation
-from lcplearn.formulations.networks import features, log_parameter, network, positive
+from lcplearn.datasets.recordings import Windows
+from lcplearn.domains import positive
+from lcplearn.formulations.line.formulation import LineFormulation, Prediction, first_step
+from lcplearn.formulations.networks import features, log_parameter, network
+from lcplearn.lcp.solve import solve_lcp
+from lcplearn.scenes.violation import violation
 
 
-class FrictionLCP(Formulation):
+class FrictionLCP(LineFormulation):
     """Solve the two-row friction LCP of a learned free velocity b, inverse mass a and impulse limit c.
 
     0 <= (v+, v-)  ⊥  (c - b / a + v+ / a,  c + b / a + v- / a) >= 0,   v_{k+1} = v+ - v- = S(b, a c)
@@ -17,17 +23,11 @@ class FrictionLCP(Formulation):
     with S(b, l) = sign(b) max(|b| - l, 0). Only b, a > 0 and c > 0 are learned, so the block sticks exactly wherever
     |b| <= a c, whatever errors the learned values have. Subclasses say what b, a and c are.
 
-    Attributes:
-        temperature: Softening T of the threshold [m/s]; at 0 the LCP is solved. Above 0, T softplus((+-b - a c) / T)
-            replaces (v+, v-): its gradient with respect to c is nowhere zero, so training may start with it where no
-            sample is predicted to slip (the plateau) and anneal it to 0. Predictions are made at 0.
+    Softened to a temperature T, T softplus((+-b - a c) / T) replaces (v+, v-): its gradient with respect to c is
+    nowhere zero, so training may start with it where no sample is predicted to slip (the plateau) and anneal it to 0.
 
-    Source: notes section 3.2; NOTES 6.
+    Source: Pfrommer's "LCP Notes" (2019), section 3.2; NOTES 6.3.
     """
-
-    def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
-        super().__init__(dt=dt, gravity=gravity)
-        self.temperature = 0.0
 
     def free_velocity(
         self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
@@ -47,23 +47,32 @@ class FrictionLCP(Formulation):
         """a c: the largest change of velocity that friction can make in one step [m/s]."""
         return self.inverse_mass() * self.impulse_limit(velocity)
 
-    def next_velocity(
+    def predict(
         self,
         velocity: Float[Tensor, "*batch"],
         force: Float[Tensor, "*batch"],
         friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
+    ) -> Prediction:
         b = self.free_velocity(velocity, force)
         signed = torch.stack((b, -b), dim=-1)
         if self.temperature > 0.0:
             excess = signed - self.velocity_limit(velocity)[..., None]
             parts = self.temperature * softplus(excess / self.temperature)
-        else:
-            a = self.inverse_mass()
-            M = torch.eye(2, dtype=b.dtype, device=b.device) / a
-            q = self.impulse_limit(velocity)[..., None] - signed / a
-            parts = self.solve(M, q, method="diagonal").z
-        return parts[..., 0] - parts[..., 1]
+            return parts[..., 0] - parts[..., 1], None
+        a = self.inverse_mass()
+        M = torch.eye(2, dtype=b.dtype, device=b.device) / a
+        q = self.impulse_limit(velocity)[..., None] - signed / a
+        solution = solve_lcp(M, q, method="diagonal")
+        return solution.z[..., 0] - solution.z[..., 1], solution
+
+    def errors(self) -> dict[str, Callable[[Windows], Tensor]]:
+        """Beside the usual: violation, how badly the best friction explains a measured step."""
+        return super().errors() | {"violation": self._violation_error}
+
+    def _violation_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        before, force, _ = first_step(windows)
+        after = windows.states[:, 1, 1]
+        return violation(after, after - self.free_velocity(before, force), self.velocity_limit(before))
 
 
 class Structured(FrictionLCP):
@@ -131,49 +140,4 @@ class Structured(FrictionLCP):
             values["mu"] = (self.log_a + self.log_c).exp().item() / (self.gravity * self.dt)
         if self.b_net is None and self.b_weight.requires_grad:
             values["mass"] = self.b_weight[1].reciprocal().item()
-        return values
-
-
-class Physical(FrictionLCP):
-    """Learn friction coefficient and mass of the sliding block.
-
-    b = v + u dt / m,   a = 1 / m,   c = mu m g dt,   from log mu and log m
-
-    Args:
-        dt: Time step [s].
-        gravity: Acceleration of gravity [m/s^2].
-        initial_mu: Friction coefficient at the start; > 0, well below the expected one (see `Structured`).
-        initial_mass: Mass [kg] at the start, or for good if it isn't learned; > 0.
-        learn_mass: False keeps the mass, for instance where no force is applied and it has no effect.
-    """
-
-    def __init__(
-        self,
-        *,
-        dt: float,
-        gravity: float = 9.81,
-        initial_mu: float = 0.1,
-        initial_mass: float = 1.0,
-        learn_mass: bool = True,
-    ) -> None:
-        super().__init__(dt=dt, gravity=gravity)
-        self.log_mu = log_parameter("initial_mu", initial_mu)
-        self.log_mass = log_parameter("initial_mass", initial_mass)
-        self.log_mass.requires_grad_(learn_mass)
-
-    def free_velocity(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
-        return velocity + force * self.dt * self.inverse_mass()
-
-    def inverse_mass(self) -> Float[Tensor, ""]:
-        return (-self.log_mass).exp()
-
-    def impulse_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
-        return (self.log_mu + self.log_mass).exp() * (self.gravity * self.dt)
-
-    def physical_parameters(self) -> dict[str, float]:
-        values = {"mu": self.log_mu.exp().item()}
-        if self.log_mass.requires_grad:
-            values["mass"] = self.log_mass.exp().item()
         return values

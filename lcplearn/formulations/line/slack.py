@@ -4,7 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.formulations.direct import KnownFriction
+from lcplearn.formulations.line.direct import KnownFriction
+from lcplearn.formulations.line.formulation import Prediction
+from lcplearn.lcp.solve import solve_lcp
 
 
 class Slack(KnownFriction):
@@ -15,9 +17,9 @@ class Slack(KnownFriction):
 
     Velocity and slack are complementary, so what was learned is an LCP and a prediction needs no friction. Where both
     slacks are positive both velocities are exactly zero, with any f and G: the block sticks. Where G is not a P-matrix
-    the LCP may have no solution; `last_solution` says so.
+    the LCP may have no solution; the status of a step's solution says so.
 
-    Source: notes section 3.1.2; errata 20, 21; NOTES 6.
+    Source: Pfrommer's "LCP Notes" (2019), section 3.1.2; NOTES 6.2.
     """
 
     def __init__(self, *, dt: float, gravity: float = 9.81) -> None:
@@ -25,11 +27,11 @@ class Slack(KnownFriction):
         with torch.no_grad():
             self.G.copy_(torch.eye(2))  # unit mass: the first predictions are solvable LCPs
 
-    def next_velocity(
+    def predict(
         self,
         velocity: Float[Tensor, "*batch"],
         force: Float[Tensor, "*batch"],
         friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
-        parts = self.solve(self.G, self.free_parts(velocity, force)).w
-        return parts[..., 0] - parts[..., 1]
+    ) -> Prediction:
+        solution = solve_lcp(self.G, self.free_parts(velocity, force))
+        return solution.w[..., 0] - solution.w[..., 1], solution

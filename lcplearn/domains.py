@@ -1,0 +1,48 @@
+"""Which numbers an argument may be: checked in one place, and read where numbers are learned."""
+
+import math
+from typing import Any, NamedTuple
+
+
+class Domain(NamedTuple):
+    """Numbers from low to high; finite, and without the ends where these are open."""
+
+    low: float
+    high: float
+    open_low: bool
+    words: str
+
+    def __contains__(self, value: object) -> bool:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            return False
+        return self.low <= value <= self.high and not (self.open_low and value == self.low)
+
+
+REAL = Domain(-math.inf, math.inf, False, "a finite number")
+POSITIVE = Domain(0.0, math.inf, True, "a positive number")
+NOT_NEGATIVE = Domain(0.0, math.inf, False, "a number of at least 0")
+SHARE = Domain(0.0, 1.0, False, "a number from 0 to 1")
+
+
+def check(domain: Domain, **values: Any) -> None:
+    """Check numbers by name; what is not a Python number (a tensor, say) is left to whoever made it.
+
+    Looking into a tensor would wait for its device.
+
+    Raises:
+        ValueError: A number is outside the domain.
+    """
+    for name, value in values.items():
+        if isinstance(value, int | float) and value not in domain:
+            raise ValueError(f"{name}: expected {domain.words}, got {value}")
+
+
+def positive(name: str, value: float) -> float:
+    """A positive, finite number, as float.
+
+    Raises:
+        ValueError: It is not one; the message names it.
+    """
+    if value not in POSITIVE:
+        raise ValueError(f"{name}: expected a positive number, got {value!r}")
+    return float(value)

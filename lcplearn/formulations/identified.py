@@ -1,0 +1,172 @@
+"""A scene whose named numbers are learned."""
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lcplearn.datasets.recordings import Windows
+from lcplearn.domains import REAL, SHARE, Domain
+from lcplearn.formulations.formulation import Formulation
+from lcplearn.scenes.scene import Drive, Scene, Step
+from lcplearn.scenes.sliding_block import SlidingBlock
+
+Number = float | Sequence[float]
+
+
+class Identified(Formulation):
+    """Learn named numbers of a scene: the scene's own step, with parameters in their place.
+
+    A number stays in the domain that the scene declares for it (its `numbers`): positive ones are learned as their
+    logarithm, shares from 0 to 1 as their logit.
+
+    Args:
+        scene: Class of the scene, or its dotted name: a dataclass with `numbers` and `advance`.
+        dt: Time step [s].
+        given: Known values by name, lists for tensors; those that the scene has no use for are left aside.
+        learn: Start of each learned number, or list of numbers, by name.
+
+    Raises:
+        ValueError: scene can't be imported or has no numbers, learn names none of them or starts outside its domain,
+            or a value that the scene needs is neither given nor learned.
+    """
+
+    def __init__(
+        self,
+        *,
+        scene: str | type,
+        dt: float,
+        learn: Mapping[str, Number],
+        given: Mapping[str, Any] | None = None,
+    ) -> None:
+        kind = _class(scene)
+        fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
+        domains: Mapping[str, Domain] = kind.numbers
+        unknown = [name for name in learn if name not in domains]
+        if unknown or not learn:
+            got = unknown[0] if unknown else "none"
+            raise ValueError(f"learn: expected numbers of {kind.__name__} ({', '.join(domains)}), got {got}")
+        known = {name: value for name, value in (given or {}).items() if name in fields and name not in learn}
+        missing = [
+            name
+            for name, field in fields.items()
+            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            if name not in ("dt", *known, *learn)
+        ]
+        if missing:
+            raise ValueError(f"given: expected {', '.join(missing)} of {kind.__name__}, got {', '.join(known)}")
+        learned = {name: domains[name] for name in learn}
+        starts = {name: _free(f"learn.{name}", value, domains[name]) for name, value in learn.items()}
+        fixed = {name: _tensor(value) if isinstance(value, list) else value for name, value in known.items()}
+        start = kind(dt=dt, **fixed, **{name: _tensor(value) for name, value in learn.items()})
+        super().__init__(space=start.space, dt=dt, given=fixed)
+        self.fixed = fixed
+        self.contacts, self.radius = start.contacts, getattr(start, "radius", 1.0)
+        self.scene_type, self.domains = kind, learned
+        self.free = nn.ParameterDict(starts)
+
+    def numbers(self) -> dict[str, Tensor]:
+        """The learned numbers, differentiable."""
+        return {name: _bound(self.free[name], domain) for name, domain in self.domains.items()}
+
+    def moving(self) -> Scene:
+        numbers: dict[str, Any] = {**self.fixed, **self.numbers()}
+        if self.temperature:
+            numbers["temperature"] = self.temperature
+        scene: Scene = self.scene_type(dt=self.dt, **numbers)
+        return scene
+
+    def advance(self, state: Float[Tensor, "*batch nq_plus_nv"], drive: Drive) -> Step:
+        return self.moving().advance(state, drive)
+
+    def errors(self) -> dict[str, Callable[[Windows], Tensor]]:
+        """Beside the usual: violation, where the scene has it."""
+        more = {"violation": self._violation_error} if hasattr(self.scene_type, "violation") else {}
+        return super().errors() | more
+
+    def _violation_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        scene: Any = self.moving()
+        found: Tensor = scene.violation(windows.states[:, 0], windows.drive.at(0), windows.states[:, 1])
+        return found
+
+    def physical_parameters(self) -> dict[str, float]:
+        values: dict[str, float] = {}
+        for name, value in self.numbers().items():
+            flat = value.detach().reshape(-1).tolist()
+            values |= {name if value.ndim == 0 else f"{name}_{k}": number for k, number in enumerate(flat, start=1)}
+        return values
+
+
+class Physical(Identified):
+    """Learn friction coefficient and mass of a sliding block.
+
+    Args:
+        dt: Time step [s].
+        gravity: Acceleration of gravity [m/s^2].
+        initial_mu: Friction coefficient at the start; > 0, well below the expected one: if no sample is predicted to
+            slip, the prediction loss has no gradient.
+        initial_mass: Mass [kg] at the start, or for good if it isn't learned; > 0.
+        learn_mass: False keeps the mass, for instance where no force is applied and it has no effect.
+    """
+
+    def __init__(
+        self,
+        *,
+        dt: float,
+        gravity: float = 9.81,
+        initial_mu: float = 0.1,
+        initial_mass: float = 1.0,
+        learn_mass: bool = True,
+    ) -> None:
+        learn, given = {"mu": initial_mu}, {"gravity": gravity}
+        (learn if learn_mass else given)["mass"] = initial_mass
+        super().__init__(scene=SlidingBlock, dt=dt, learn=learn, given=given)
+        self.given = {"gravity": gravity}  # a mass that isn't learned has no effect, so data may have another
+        self.register_load_state_dict_pre_hook(_rename)
+
+
+def _rename(module: nn.Module, state: dict[str, Any], prefix: str, *others: Any) -> None:
+    """Checkpoints from before `Identified` call the logarithms log_mu and log_mass; they have a fixed mass, too."""
+    for name in ("mu", "mass"):
+        value = state.pop(f"{prefix}log_{name}", None)
+        if value is not None and f"free.{name}" in dict(module.named_parameters()):
+            state[f"{prefix}free.{name}"] = value
+
+
+def _class(scene: str | type) -> Any:
+    if isinstance(scene, str):
+        module, _, name = scene.rpartition(".")
+        try:
+            found = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError):
+            raise ValueError(f"scene: expected the dotted name of a class, got {scene!r}") from None
+    else:
+        found = scene
+    if not (dataclasses.is_dataclass(found) and hasattr(found, "numbers") and hasattr(found, "advance")):
+        raise ValueError(f"scene: expected a dataclass with `numbers` and `advance`, got {scene!r}")
+    return found
+
+
+def _free(name: str, value: Number, domain: Domain) -> nn.Parameter:
+    """The parameter, free of bounds, of a number in its domain."""
+    start = _tensor(value)
+    inside = all(number in domain and number not in (domain.low, domain.high) for number in start.reshape(-1).tolist())
+    if not inside:
+        raise ValueError(f"{name}: expected {domain.words}, inside its bounds, got {value}")
+    if domain is REAL:
+        return nn.Parameter(start.clone())
+    return nn.Parameter(start.logit() if domain is SHARE else start.log())
+
+
+def _tensor(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+def _bound(free: Tensor, domain: Domain) -> Tensor:
+    if domain is REAL:
+        return free
+    return free.sigmoid() if domain is SHARE else free.exp()

@@ -1,0 +1,1 @@
+"""Models of the scalar velocity of a block on a line."""

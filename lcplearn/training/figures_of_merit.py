@@ -1,0 +1,55 @@
+"""What models are judged by: the name, meaning and heading of each figure of metrics.json, without torch."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+
+class Figure(NamedTuple):
+    """A figure of merit.
+
+    Attributes:
+        name: Its key in metrics.json.
+        meaning: Unit and meaning.
+        heading: Of its column in a comparison.
+        more_is_better: Whether a larger one is better; of all others a smaller one is, or neither.
+    """
+
+    name: str
+    meaning: str
+    heading: str
+    more_is_better: bool = False
+
+
+FIGURES = (
+    Figure("velocity_rmse", "m/s, one step", "one-step [m/s]"),
+    Figure("stick_accuracy", "share of true sticks with |v| < 1e-12 m/s", "stick", more_is_better=True),
+    Figure("false_stick", "share of true slips with |v| < 1e-12 m/s", "false stick"),
+    Figure("rollout_rmse_100", "m/s, over 100 steps", "100 steps"),
+    Figure("rollout_rmse_1000", "m/s, over 1000 steps", "1000 steps"),
+    Figure("mu_error", "|learned - true|", "mu error"),
+    Figure("mass_error", "kg, |learned - true|", "mass error"),
+    Figure("stop_error_median_mm", "mm, where the slide ends", "stop [mm]"),
+    Figure("stop_error_p90_mm", "mm, 90th percentile", "stop p90"),
+    Figure("rest_share", "share of slides at rest at their end", "at rest", more_is_better=True),
+    Figure("unsolved_share", "share of LCPs without a verified solution", "unsolved"),
+    Figure("mu", "learned friction coefficient", "mu"),
+    Figure("parameters", "learned numbers", "parameters"),
+    Figure("train_seconds", "s", "train [s]"),
+    Figure("predict_us", "us, one step of one body", "step [us]"),
+)
+KEYS = tuple(figure.name for figure in FIGURES)
+_BY_NAME = {figure.name: figure for figure in FIGURES}
+
+
+def figure(name: str) -> Figure:
+    """A figure by its name; of learned numbers any name will do, and NAME_error."""
+    if name in _BY_NAME:
+        return _BY_NAME[name]
+    meaning = "|learned - true|" if name.endswith("_error") else "learned"
+    return Figure(name, meaning, name.replace("_", " "))
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names of figures in the order of the table; those of learned numbers follow as they come."""
+    there = dict.fromkeys(names)
+    return [name for name in KEYS if name in there] + [name for name in there if name not in _BY_NAME]
