@@ -4,15 +4,17 @@ Same rows, same iteration, same rest. The LCPs go to the layer's kernel by its a
 """
 
 from functools import cache
+from hashlib import sha256
 from inspect import unwrap
 from math import sqrt
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import torch
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 from torch import Tensor
 
@@ -23,67 +25,66 @@ LARGEST = 1.7976931348623157e308  # of all doubles
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
-def _jit(function: Any) -> Any:
-    """numba.njit with a cache, or without one where no cache folder can be written."""
+def compiled(function: Any, cached: bool = False) -> Any:
+    """numba.njit; with a cache if asked for and a cache folder can be written."""
     function = unwrap(function)  # in tests jaxtyping wraps every function
     try:
-        return numba.njit(cache=True, **_OPTIONS)(function)
+        return numba.njit(cache=cached, **_OPTIONS)(function)
     except RuntimeError:  # "cannot cache function: no locator available"
         return numba.njit(**_OPTIONS)(function)
+
+
+def fingerprint(*files: str) -> str:
+    """Of the sources of a compiled function: numba watches one file, but a closure's values are part of its key."""
+    folder = Path(__file__).parent
+    return sha256(b"".join((folder / name).read_bytes() for name in files)).hexdigest()
+
+
+def address_of(function: Any) -> int:
+    """Where the code of a compiled function is; it must have been called with one set of types."""
+    (code,) = function.overloads.values()
+    return int(code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name))
+
+
+def _call_code(_: Any, address: Any, arguments: Any) -> Any:
+    """Call compiled code at an address with a tuple of arguments of the types that it was compiled for."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        values = cgutils.unpack_tuple(builder, args[1])
+        kind = ir.FunctionType(ir.VoidType(), [x.type for x in values])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)
+        return context.get_dummy_value()
+
+    return types.void(address, arguments), codegen
+
+
+call: Any = intrinsic(_call_code)
 
 
 @cache
 def solver_address() -> int:
     """Where the layer's compiled solver is."""
-    identity, ones = np.eye(2), np.ones(2)
-    pivoting.solve_batch(
-        torch.from_numpy(identity), torch.from_numpy(-ones), single_precision=False, max_iter=None
-    )  # compiles it
-    (compiled,) = pivoting._solve_range.overloads.values()
-    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
+    M, q = torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
+    pivoting.solve_batch(M, q, single_precision=False, max_iter=None)
+    return address_of(pivoting._solve_range)
 
 
-def _call_solver_code(_: Any, address: Any, n: Any, M: Any, q: Any, scratch: Any, out: Any) -> Any:
-    """Call `pivoting._solve_range` at an address for one problem; out is where z, w, then the rest of the answer go."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        where, size, M_at, q_at, scratch_array, out_at = args
-        integer = context.get_value_type(types.int64)
-
-        def number(value: int) -> Any:
-            return ir.Constant(integer, value)
-
-        def at(words: Any) -> Any:
-            return builder.add(out_at, builder.mul(words, number(8)))
-
-        bit = context.get_value_type(types.boolean)
-        no, twice = ir.Constant(bit, 0), builder.add(size, size)
-        tol = ir.Constant(context.get_value_type(types.float64), 1e-10)
-        # z [n], w [n], certificate [n], basis [n] bytes in n words, residual, status, iterations
-        third, fourth = builder.add(twice, size), builder.add(twice, twice)
-        arguments = [
-            number(1), size, no, M_at, q_at, tol, no, number(-1), no, scratch_array,
-            at(number(0)), at(size), at(third), at(fourth), at(builder.add(fourth, number(1))),
-            at(builder.add(fourth, number(2))), at(twice),
-        ]  # fmt: skip
-        kind = ir.FunctionType(ir.VoidType(), [x.type for x in arguments])
-        builder.call(builder.inttoptr(where, kind.as_pointer()), arguments)
-        return context.get_dummy_value()
-
-    return types.void(address, n, M, q, scratch, out), codegen
-
-
-_call_solver: Any = intrinsic(_call_solver_code)
-
-
-@_jit
+@compiled
 def _solve_lcp(address, n, M, q, scratch, out):
     """Whether M [n, n], q [n] was solved; z and w are the first 2 n numbers of out."""
-    _call_solver(address, n, M.ctypes.data, q.ctypes.data, scratch, out.ctypes.data)
+    # z [n], w [n], certificate [n], basis [n] bytes in n words, residual, status, iterations
+    at, word = out.ctypes.data, 8
+    call(
+        address,
+        (
+            1, n, False, M.ctypes.data, q.ctypes.data, 1e-10, False, -1, False, scratch, at, at + word * n,
+            at + word * 3 * n, at + word * 4 * n, at + word * (4 * n + 1), at + word * (4 * n + 2), at + word * 2 * n,
+        ),
+    )  # fmt: skip
     return out[4 * n + 1 : 4 * n + 2].view(np.int64)[0] == 0
 
 
-@_jit
+@compiled
 def _delassus(rows, mass, free, count, nv, D, u):
     """D = J mass^-1 J' and u = J free, for the first count rows."""
     for i in range(count):
@@ -98,7 +99,7 @@ def _delassus(rows, mass, free, count, nv, D, u):
             D[i, j] = D[j, i] = s
 
 
-@_jit
+@compiled
 def _rotate(D, u, axes, K, A, r):
     """D and u in rows n, t, s instead of n, x, y."""
     for i in range(3 * K):
@@ -115,7 +116,7 @@ def _rotate(D, u, axes, K, A, r):
             A[K + i, j], A[2 * K + i, j] = c * x + s * y, c * y - s * x
 
 
-@_jit
+@compiled
 def _cholesky(H, n):
     """Lower factor in place; whether H is positive definite."""
     for j in range(n):
@@ -132,7 +133,7 @@ def _cholesky(H, n):
     return True
 
 
-@_jit
+@compiled
 def _condense(A, r, root, K, H, X):
     """Eliminate the rows s, f_s = -X (f, 1): X = root (1 + root A_ss root)^-1 root (A_s., r_s)."""
     for i in range(K):
@@ -161,7 +162,7 @@ def _condense(A, r, root, K, H, X):
             r[i] -= a * X[k, 2 * K]
 
 
-@_jit
+@compiled
 def _cone_rows(A, r, target, mu, compliance, K, M_flat, q):
     """Rows lambda, a, sigma of `friction_lcp`, from A and r in rows n, t."""
     n = 3 * K
@@ -179,7 +180,7 @@ def _cone_rows(A, r, target, mu, compliance, K, M_flat, q):
         q[i], q[K + i], q[2 * K + i] = r[i] - target[i], r[K + i], 0.0
 
 
-@_jit
+@compiled
 def _apply(rows, mass, free, impulse, count, nv, v):
     for k in range(nv):
         s = 0.0
@@ -188,7 +189,7 @@ def _apply(rows, mass, free, impulse, count, nv, v):
         v[k] = free[k] + s / mass[k]
 
 
-@_jit
+@compiled
 def _mass_norm(mass, v, nv):
     s = 0.0
     for k in range(nv):
@@ -196,7 +197,7 @@ def _mass_norm(mass, v, nv):
     return sqrt(s)
 
 
-@_jit
+@compiled
 def _choose_axes(slip, friction, load, sticks, mu, scale, K, axes, root):
     """Facets along the slip or against the friction force, and the root of the weight across them."""
     for i in range(K):
@@ -211,7 +212,7 @@ def _choose_axes(slip, friction, load, sticks, mu, scale, K, axes, root):
         root[i] = sqrt(mu[i] * load[i] / floor) if floor > 0.0 else 0.0
 
 
-@_jit
+@compiled
 def _solve_cone(
     address, K, nv, rows, target, mu, compliance, free, mass, scale, numbers, v, load, friction, slip, sticks
 ):
@@ -273,7 +274,7 @@ def _solve_cone(
     return solved, settled
 
 
-@_jit
+@compiled
 def _solve_plane(address, K, nv, T, rows, target, mu, compliance, free, mass, numbers, v, load, friction, slip, sticks):
     """The LCP of K contacts with at most one friction direction; whether it was solved."""
     D, M, q, u, impulse, scratch, out = (
@@ -304,7 +305,7 @@ def _solve_plane(address, K, nv, T, rows, target, mu, compliance, free, mass, nu
     return solved
 
 
-@_jit
+@compiled
 def _rests(C, nv, T, target, normal, tangents, mass, scale, v, load, sticks, gram):
     """As `contact._at_rest`."""
     if T == 0:
@@ -335,7 +336,7 @@ def _rests(C, nv, T, target, normal, tangents, mass, scale, v, load, sticks, gra
     return _cholesky(gram, nv)
 
 
-@_jit
+@compiled
 def _workspace(C, nv, T):
     """Memory for an element with C contacts."""
     n = 3 * C
@@ -346,9 +347,9 @@ def _workspace(C, nv, T):
     )  # fmt: skip
 
 
-@_jit
+@compiled
 def _members(active, index):
-    """Number of active contacts; their numbers go to index. (A function: numba would take a count for a literal.)"""
+    """Number of active contacts; their numbers go to index. Inlined, numba would compile for the count 0 apart."""
     count = 0
     for i in range(active.size):
         if active[i]:
@@ -357,8 +358,8 @@ def _members(active, index):
     return count
 
 
-@_jit
-def solve_element(
+@compiled
+def _solve_element(
     address, C, nv, T, rest, target, normal, tangents, mu, compliance, free, mass, numbers, part, rows, index, active,
     gram, scale, v, load, friction, sticks,
 ):  # fmt: skip
@@ -421,7 +422,7 @@ def solve_element(
     return solved, settled, at_rest
 
 
-@_jit
+@compiled
 def _parts(C):
     """Memory for the contacts that an element needs."""
     return (
@@ -430,20 +431,38 @@ def _parts(C):
     )  # fmt: skip
 
 
-@_jit
-def _solve_all(
-    address, rest, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, sticks, flags
-):
-    B, C, nv = normal.shape
-    T = tangents.shape[2]
-    numbers, part = _workspace(C, nv, T), _parts(C)
-    rows, index, active = np.empty((3 * C, nv)), np.empty(C, np.int64), np.empty(C, np.bool_)
-    gram, scale = np.empty((nv, nv)), np.empty(C)
-    for b in range(B):
-        flags[b, 0], flags[b, 1], flags[b, 2] = solve_element(
-            address, C, nv, T, rest, target[b], normal[b], tangents[b], mu[b], compliance[b], free[b], mass[b],
-            numbers, part, rows, index, active, gram, scale, velocity[b], load[b], friction[b], sticks[b],
-        )  # fmt: skip
+def _make_solve_all(sources: str) -> Any:
+    def _solve_all(
+        address, rest, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, sticks, flags
+    ):
+        sources  # noqa: B018, for the cache
+        B, C, nv = normal.shape
+        T = tangents.shape[2]
+        numbers, part = _workspace(C, nv, T), _parts(C)
+        rows, index, active = np.empty((3 * C, nv)), np.empty(C, np.int64), np.empty(C, np.bool_)
+        gram, scale = np.empty((nv, nv)), np.empty(C)
+        for b in range(B):
+            flags[b, 0], flags[b, 1], flags[b, 2] = _solve_element(
+                address, C, nv, T, rest, target[b], normal[b], tangents[b], mu[b], compliance[b], free[b], mass[b],
+                numbers, part, rows, index, active, gram, scale, velocity[b], load[b], friction[b], sticks[b],
+            )  # fmt: skip
+
+    return compiled(_solve_all, cached=True)
+
+
+_solve_all = _make_solve_all(fingerprint("contact_kernel.py", "friction_lcp.py"))
+
+
+@cache
+def contacts_address() -> int:
+    """Where the compiled solver of contacts is; called as `_solve_all` is."""
+    one, row, rows = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
+    flags = np.empty((1, 3), np.bool_)
+    _solve_all(
+        solver_address(), True, -one, row, rows, one, one, one, one, one.copy(), one.copy(), row.copy(),
+        flags[:, :1].copy(), flags,
+    )  # fmt: skip
+    return address_of(_solve_all)
 
 
 def solve(problem: Problem, rest: bool) -> tuple[Answer, Tensor]:

@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
-from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, contact_step, rebound
+from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, compiled_contacts, contact_step, rebound
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
-from lcplearn.scenes.scene import Drive, Step
+from lcplearn.scenes.scene import Drive, Step, Trajectory, rollout
 from lcplearn.scenes.space import POSE, Space, rotation_matrix
 
 
@@ -91,6 +91,10 @@ class SpatialBody:
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one step; the mode is that of each corner."""
+        path = self._compiled(state, drive.force.unsqueeze(-2))
+        if path is not None:
+            state = torch.cat((path.positions[..., 1, :], path.velocities[..., 1, :]), dim=-1)
+            return Step(state, path.mode[..., 0, :], None, None if path.solved is None else path.solved[..., 0])
         position, before = POSE.split(state)
         turn = rotation_matrix(position[..., 3:])
         mass = self._mass(state)
@@ -103,16 +107,65 @@ class SpatialBody:
         state = torch.cat((moved, found.velocity), dim=-1)
         return Step(state, found.mode, None, found.solved & found.settled)
 
+    def rollout(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Trajectory:
+        """As `scene.rollout`, in one compiled loop where that is possible: on the CPU, without gradients."""
+        path = self._compiled(state, drive.force)
+        return rollout(self, state, drive) if path is None else path
+
+    def _compiled(self, state: Tensor, force: Tensor) -> Trajectory | None:
+        """The rollout of force [*batch, T, 6] by `spatial_kernel`; None where it can't be."""
+        numbers = (self.radius, self.restitution, self.mu, self.mu if self.mu_impact is None else self.mu_impact)
+        tensors = [x for x in (*vars(self).values(), state, force) if isinstance(x, Tensor)]
+        tensors += [x for x in self.inertia if isinstance(x, Tensor)] if isinstance(self.inertia, tuple) else []
+        if self.polygon is not None or compiled_contacts(state.device) is None:
+            return None
+        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+            return None
+        if any(x.dtype is not torch.float64 for x in (state, force)):
+            return None
+        from lcplearn.scenes.spatial_kernel import roll
+
+        POSE.split(state)
+        mass = self._mass(state)
+        compliance = as_tensor(self.compliance, state) / as_tensor(self.mass, state)
+        given = stack_numbers(*numbers, self.ground, compliance, like=state)
+        shapes = (state.shape[:-1], force.shape[:-2], self.corners.shape[:-2], mass.shape[:-1], given.shape[:-1])
+        down = self._gravity(state)
+        batch = torch.broadcast_shapes(*shapes, down.shape[:-1])
+
+        def flat(x: Tensor, *shape: int) -> Tensor:
+            return x.expand(*batch, *shape).reshape(batch.numel(), *shape).double()
+
+        states, mode, solved = roll(
+            flat(state, 13),
+            flat(force, *force.shape[-2:]),
+            flat(self.corners, self.contacts, 3),
+            flat(mass, 6),
+            flat(given, 6),
+            flat(down, 3),
+            dt=self.dt,
+            newton=self.restitution_law == "newton",
+            gyroscopic=isinstance(self.inertia, tuple),
+            rest=self.rest,
+            impact_speed=self.impact_speed,
+        )
+        states, mode, solved = (x.reshape((*batch, *x.shape[1:])) for x in (states, mode, solved))
+        return Trajectory(*POSE.split(states), mode, solved)
+
     def _mass(self, like: Tensor) -> Tensor:
         """Diagonal of the mass matrix [*batch, 6]."""
         inertia = self.inertia if isinstance(self.inertia, tuple) else (self.inertia,) * 3
         return stack_numbers(self.mass, self.mass, self.mass, *inertia, like=like)
 
+    def _gravity(self, like: Tensor) -> Tensor:
+        """Acceleration of gravity as a vector [*batch, 3]."""
+        gravity = as_tensor(self.gravity, like)
+        if gravity.shape[-1:] == (3,):
+            return gravity
+        return torch.stack((torch.zeros_like(gravity), torch.zeros_like(gravity), -gravity), dim=-1)
+
     def _free_velocity(self, velocity: Tensor, turn: Tensor, force: Tensor, mass: Tensor) -> Tensor:
-        gravity = as_tensor(self.gravity, velocity)
-        if gravity.shape[-1:] != (3,):
-            gravity = torch.stack((torch.zeros_like(gravity), torch.zeros_like(gravity), -gravity), dim=-1)
-        linear = velocity[..., :3] + self.dt * (gravity + force[..., :3] / mass[..., :3])
+        linear = velocity[..., :3] + self.dt * (self._gravity(velocity) + force[..., :3] / mass[..., :3])
         spin = velocity[..., 3:]
         if isinstance(self.inertia, tuple):
             spin = _midpoint_spin(spin, mass[..., 3:], self.dt)

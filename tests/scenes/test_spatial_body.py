@@ -148,3 +148,21 @@ def test_a_state_of_nan_is_not_solved_and_harms_no_neighbour():
         step, alone = body().advance(state, NOTHING), body().advance(state[2:], NOTHING)
     assert step.solved.tolist() == [True, False, True]
     assert (step.state[2] == alone.state[0]).all()
+
+
+@pytest.mark.parametrize("law", ["newton", "continuous"])
+def test_the_compiled_rollout_is_that_of_torch(law):
+    pytest.importorskip("numba")
+    other = {"mu_impact": 0.2, "restitution": 0.3, "radius": 0.005, "restitution_law": law, "compliance": 1e-3}
+    state, push = tossed(12, seed=5), 0.1 * torch.randn(12, 15, 6, generator=torch.Generator().manual_seed(6))
+    for scene in (body(**other), body(**other, inertia=0.001)):
+        compiled = scene.rollout(state, Drive(push))
+        state.requires_grad_()  # which torch alone can do
+        path = scene.rollout(state, Drive(push))
+        state.requires_grad_(False)
+        assert path.positions.requires_grad
+        assert not compiled.positions.requires_grad
+        torch.testing.assert_close(compiled.positions, path.positions.detach(), rtol=0, atol=1e-11)
+        torch.testing.assert_close(compiled.velocities, path.velocities.detach(), rtol=0, atol=1e-10)
+        assert (compiled.mode == path.mode).all()
+        assert (compiled.solved == path.solved).all()

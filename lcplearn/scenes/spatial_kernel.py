@@ -1,0 +1,184 @@
+"""Steps and rollouts of bodies in space on the CPU, compiled: `spatial_body.py` without gradients."""
+
+from math import cos, sin, sqrt
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lcplearn.scenes.contact_kernel import call, compiled, contacts_address, fingerprint, solver_address
+
+_SMALL = 1e-8  # squared half angle below which series are exact; as in space.py
+STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
+
+
+@compiled
+def _rotation(q, R):
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+
+
+@compiled
+def _turn(q, w, dt):
+    """q exp(dt w), of norm 1."""
+    a, b, c = dt * w[0], dt * w[1], dt * w[2]
+    square = (a * a + b * b + c * c) / 4.0
+    half = sqrt(square)
+    if square < _SMALL:
+        cosine, sinc = 1.0 - square / 2.0, 1.0 - square / 6.0
+    else:
+        cosine, sinc = cos(half), sin(half) / half
+    a, b, c = sinc * a / 2.0, sinc * b / 2.0, sinc * c / 2.0
+    w0, x0, y0, z0 = q[0], q[1], q[2], q[3]
+    q[0] = w0 * cosine - (x0 * a + y0 * b + z0 * c)
+    q[1] = w0 * a + cosine * x0 + (y0 * c - z0 * b)
+    q[2] = w0 * b + cosine * y0 + (z0 * a - x0 * c)
+    q[3] = w0 * c + cosine * z0 + (x0 * b - y0 * a)
+    norm = sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for i in range(4):
+        q[i] /= norm
+
+
+@compiled
+def _midpoint_spin(w, inertia, dt):
+    """As in spatial_body.py, in place; the 3 x 3 systems by Cramer's rule."""
+    i0, i1, i2 = inertia[0], inertia[1], inertia[2]
+    h = dt / 2.0
+    x, y, z = w[0], w[1], w[2]
+    for _ in range(4):
+        e0 = i0 * (x - w[0]) + h * (i2 - i1) * y * z
+        e1 = i1 * (y - w[1]) + h * (i0 - i2) * z * x
+        e2 = i2 * (z - w[2]) + h * (i1 - i0) * x * y
+        a, b, c = i0, h * (i2 - i1) * z, h * (i2 - i1) * y
+        d, e, f = h * (i0 - i2) * z, i1, h * (i0 - i2) * x
+        g, k, m = h * (i1 - i0) * y, h * (i1 - i0) * x, i2
+        determinant = a * (e * m - f * k) - b * (d * m - f * g) + c * (d * k - e * g)
+        x -= (e0 * (e * m - f * k) - b * (e1 * m - f * e2) + c * (e1 * k - e * e2)) / determinant
+        y -= (a * (e1 * m - f * e2) - e0 * (d * m - f * g) + c * (d * e2 - e1 * g)) / determinant
+        z -= (a * (e * e2 - e1 * k) - b * (d * e2 - e1 * g) + e0 * (d * k - e * g)) / determinant
+    w[0], w[1], w[2] = 2.0 * x - w[0], 2.0 * y - w[1], 2.0 * z - w[2]
+
+
+def _make_roll(sources: str) -> Any:
+    def _roll(
+        contacts, address, dt, newton, gyroscopic, rest, impact_speed, start,
+        force, corners, mass, numbers, gravity, states, modes,
+        solved,
+    ):  # fmt: skip
+        """T steps of each element; numbers are radius, restitution, mu, mu_impact, ground, compliance."""
+        sources  # noqa: B018, for the cache
+        B, T, C = len(start), force.shape[1], corners.shape[1]
+        # what `contact_kernel` takes and gives, for a batch of one
+        normal, tangents = np.empty((1, C, 6)), np.empty((1, C, 2, 6))
+        target, friction_mu, soft = np.empty((1, C)), np.empty((1, C)), np.empty((1, C))
+        load, friction, sticks = np.empty((1, C)), np.empty((1, C, 2)), np.empty((1, C), np.bool_)
+        free_now, mass_now, v_now = np.empty((1, 6)), np.empty((1, 6)), np.empty((1, 6))
+        flags = np.empty((1, 3), np.bool_)
+        free, v = free_now[0], v_now[0]
+        R, q = np.empty((3, 3)), np.empty(4)
+        for b in range(B):
+            states[b, 0] = start[b]
+            mass_now[0] = m = mass[b]
+            radius, restitution, mu, mu_impact = numbers[b, 0], numbers[b, 1], numbers[b, 2], numbers[b, 3]
+            ground, compliance = numbers[b, 4], numbers[b, 5]
+            for t in range(T):
+                x, after = states[b, t], states[b, t + 1]
+                for i in range(4):
+                    q[i] = x[3 + i]
+                _rotation(q, R)
+                for i in range(3):
+                    free[i] = x[7 + i] + dt * (gravity[b, i] + force[b, t, i] / m[i])
+                    free[3 + i] = x[10 + i]
+                if gyroscopic:
+                    _midpoint_spin(free[3:], m[3:], dt)
+                for i in range(3):
+                    free[3 + i] += dt * force[b, t, 3 + i] / m[3 + i]
+                for i in range(C):
+                    c = corners[b, i]
+                    gap = x[2] + R[2, 0] * c[0] + R[2, 1] * c[1] + R[2, 2] * c[2] - radius - ground
+                    r0, r1, r2 = c[0] - radius * R[2, 0], c[1] - radius * R[2, 1], c[2] - radius * R[2, 2]
+                    before = after_free = 0.0
+                    for d in range(3):
+                        row = normal[0, i] if d == 2 else tangents[0, i, d]
+                        row[0], row[1], row[2] = 1.0 * (d == 0), 1.0 * (d == 1), 1.0 * (d == 2)
+                        row[3] = r1 * R[d, 2] - r2 * R[d, 1]
+                        row[4] = r2 * R[d, 0] - r0 * R[d, 2]
+                        row[5] = r0 * R[d, 1] - r1 * R[d, 0]
+                    for k in range(6):
+                        before += normal[0, i, k] * x[7 + k]
+                        after_free += normal[0, i, k] * free[k]
+                    if newton:
+                        closing = max(-before, 0.0) if gap + dt * after_free < 0.0 else 0.0
+                    else:
+                        closing = max(-before - max(gap, 0.0) / dt, 0.0)
+                    bounce = restitution * closing
+                    if newton and bounce > 0.0:
+                        bounce = max(bounce + gap / dt, 0.0)
+                    target[0, i] = bounce - gap / dt
+                    friction_mu[0, i] = mu + (mu_impact - mu) * min(closing / impact_speed, 1.0)
+                    soft[0, i] = compliance
+                call(
+                    contacts,
+                    (
+                        address, rest, target, normal, tangents, friction_mu, soft, free_now, mass_now, v_now, load,
+                        friction, sticks, flags,
+                    ),
+                )  # fmt: skip
+                at_rest = flags[0, 2]
+                solved[b, t] = flags[0, 0] and flags[0, 1]
+                for i in range(C):
+                    modes[b, t, i] = SEPARATION
+                    if load[0, i] > 0.0:
+                        modes[b, t, i] = STICK if at_rest or sticks[0, i] else SLIP
+                for k in range(6):
+                    after[7 + k] = 0.0 if at_rest else v[k]
+                if not at_rest:
+                    _turn(q, v[3:], dt)
+                for i in range(3):
+                    after[i] = x[i] + (0.0 if at_rest else dt * v[i])
+                for i in range(4):
+                    after[3 + i] = q[i]
+
+    return compiled(_roll, cached=True)
+
+
+_roll = _make_roll(fingerprint("contact_kernel.py", "spatial_kernel.py"))
+
+
+def roll(
+    start: Tensor,
+    force: Tensor,
+    corners: Tensor,
+    mass: Tensor,
+    numbers: Tensor,
+    gravity: Tensor,
+    *,
+    dt: float,
+    newton: bool,
+    gyroscopic: bool,
+    rest: bool,
+    impact_speed: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """T steps of a batch of bodies.
+
+    Args:
+        start: [B, 13].
+        force: [B, T, 6].
+        corners: [B, C, 3].
+        mass: Diagonal of the mass matrix [B, 6].
+        numbers: radius, restitution, mu, mu_impact, ground, compliance / mass [B, 6].
+        gravity: [B, 3].
+
+    Returns:
+        States [B, T + 1, 13], modes [B, T, C] and whether each step is right [B, T].
+    """
+    B, T, C = len(start), force.shape[1], corners.shape[1]
+    states, modes, solved = np.empty((B, T + 1, 13)), np.empty((B, T, C), np.int64), np.empty((B, T), np.bool_)
+    given = (x.detach().contiguous().numpy() for x in (start, force, corners, mass, numbers, gravity))
+    _roll(
+        contacts_address(), solver_address(), dt, newton, gyroscopic, rest, impact_speed, *given, states, modes, solved
+    )
+    return torch.from_numpy(states), torch.from_numpy(modes), torch.from_numpy(solved)
