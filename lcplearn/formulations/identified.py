@@ -58,7 +58,9 @@ class Identified(Formulation):
             if name not in ("dt", *known, *learn)
         ]
         if missing:
-            raise ValueError(f"given: expected {', '.join(missing)} of {kind.__name__}, got {', '.join(known)}")
+            raise ValueError(
+                f"given: expected {', '.join(missing)} of {kind.__name__}, got {', '.join(known) or 'none'}"
+            )
         learned = {name: domains[name] for name in learn}
         starts = {name: _free(f"learn.{name}", value, domains[name]) for name, value in learn.items()}
         fixed = {name: _tensor(value) if isinstance(value, list) else value for name, value in known.items()}

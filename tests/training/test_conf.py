@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from training.helpers import ROOT
 
 from lcplearn.datasets import Task, simulate_sliding_block
+from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.formulations import FORMULATIONS, Formulation, build
 from lcplearn.training import settings as checks
 from lcplearn.training.optimizer import Optimizer
@@ -34,25 +35,30 @@ def settings(*overrides: str) -> dict[str, Any]:
 
 EVERY = [f"{group}={name}" for group in ("model", "loss", "optimizer", "trainer", "logger") for name in names(group)]
 EVERY += [f"experiment={name}" for name in names("experiment")] + ["data=cube_slides model=mlp"]
+EVERY = [choice.replace("model=identified", "data=spring model=identified") for choice in EVERY]
 
 
 @pytest.fixture(scope="module")
-def task() -> Task:
-    return simulate_sliding_block(trajectories=1, long_length=1)
+def tasks() -> dict[bool, Task]:
+    """One of the spring, and one of a sliding block for everything else."""
+    return {
+        False: simulate_sliding_block(trajectories=1, long_length=1),
+        True: simulate_spring_block(trajectories=1, long_length=1),
+    }
 
 
 @pytest.mark.parametrize("choice", EVERY)
-def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, task: Task) -> None:
+def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, tasks: dict[bool, Task]) -> None:
     chosen = settings(*choice.split())
     checks.check(chosen, CONF)
     asked = instantiate(chosen["model"], _partial_=True, _convert_="all")
-    assert isinstance(build(asked.func, task, **asked.keywords), Formulation)
+    assert isinstance(build(asked.func, tasks["data=spring" in choice], **asked.keywords), Formulation)
     assert isinstance(instantiate(chosen["optimizer"], _convert_="all"), Optimizer)
 
 
 def test_every_formulation_has_a_configuration() -> None:
     targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in names("model")}
-    assert targets == {cls.__name__ for cls in FORMULATIONS.values()}
+    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified"}
 
 
 def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:

@@ -1,0 +1,41 @@
+"""Hand-made data are compared with their space, and what is wrong is named."""
+
+import pytest
+import torch
+
+from lcplearn.datasets import Recordings, Task
+from lcplearn.scenes import LINE, Drive
+
+
+def part(steps: int = 3, forces: int = 3, columns: int = 2, lengths: tuple[int, ...] = (3, 2)) -> Recordings:
+    states = torch.zeros(2, steps + 1, columns, dtype=torch.float64)
+    return Recordings(states, Drive(torch.zeros(2, forces, 1, dtype=torch.float64)), torch.tensor(lengths))
+
+
+def test_padding_may_hold_anything() -> None:
+    good = part()
+    good.states[1, 3] = float("nan")
+    assert Task("mine", LINE, 0.1, good, good, good).test.steps.tolist() == [3, 2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"forces": 1}, r"^validation\.states: expected shape \[2, 2, 2\], got \[2, 4, 2\]"),
+        ({"columns": 4}, r"^validation\.states: expected shape \[2, 4, 2\], got \[2, 4, 4\]"),
+        ({"lengths": (3, 4)}, r"^validation\.steps: expected numbers from 1 to 3, got \[3, 4\]"),
+        ({"lengths": (3, 0)}, r"^validation\.steps: expected numbers from 1 to 3"),
+    ],
+)
+def test_what_does_not_fit_is_named(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Task("mine", LINE, 0.1, part(), part(**changes), part())
+
+
+def test_states_that_are_not_finite_and_a_wrong_time_step_are_refused() -> None:
+    bad = part()
+    bad.states[0, 0, 1] = float("nan")
+    with pytest.raises(ValueError, match=r"^test\.states: expected finite numbers"):
+        Task("mine", LINE, 0.1, part(), part(), bad)
+    with pytest.raises(ValueError, match=r"^dt: expected a positive number, got 0\.0"):
+        Task("mine", LINE, 0.0, part(), part(), part())

@@ -1,0 +1,153 @@
+"""Named numbers of scenes as parameters: within their domains, with the loop closed, for states of any size."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+from training.helpers import QUIET
+
+import lcplearn
+from lcplearn.datasets import Recordings, Task, simulate_sliding_block
+from lcplearn.datasets.spring import simulate_spring_block
+from lcplearn.domains import NOT_NEGATIVE, Domain
+from lcplearn.formulations import MLP, Formulation, Identified, Physical
+from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
+from lcplearn.scenes.scene import Mode, Moving
+from lcplearn.scenes.space import Space
+from lcplearn.scenes.spring_block import SpringBlock
+from lcplearn.training import Optimizer, fit
+
+TWO_LINES = Space(positions=("x_1_m", "x_2_m"), velocities=("v_1_m_s", "v_2_m_s"))
+
+
+@dataclass(frozen=True)
+class TwoBlocks(Moving):
+    """Two blocks of 1 kg, each on a line of its own."""
+
+    space: ClassVar[Space] = TWO_LINES
+    contacts: ClassVar[int] = 2
+    numbers: ClassVar[Mapping[str, Domain]] = {"mu": NOT_NEGATIVE}
+
+    mu: Tensor
+    dt: float
+
+    def advance(self, state: Tensor, drive: Drive) -> Step:
+        position, velocity = self.space.split(state)
+        velocity = slide(velocity + drive.force * self.dt, self.mu * 9.81 * self.dt)
+        mode = torch.where(velocity == 0, int(Mode.STICK), int(Mode.SLIP))
+        return Step(torch.cat((position + self.dt * velocity, velocity), dim=-1), mode)
+
+
+def two_blocks(mu: tuple[float, float]) -> Task:
+    scene = TwoBlocks(torch.tensor(mu, dtype=torch.float64), 0.05)
+    parts = []
+    for seed in range(3):
+        generator = torch.Generator().manual_seed(seed)
+        force = 6.0 * torch.randn(6, 30, 2, generator=generator, dtype=torch.float64)
+        path = scene.rollout(torch.zeros(6, 4, dtype=torch.float64), force)
+        states = torch.cat((path.positions, path.velocities), dim=-1)
+        parts.append(Recordings(states, Drive(force), torch.full((6,), 30), states))
+    return Task("two blocks", TWO_LINES, 0.05, *parts, truth={"mu_1": mu[0], "mu_2": mu[1]}, scene=scene)
+
+
+def test_two_blocks_on_two_lines_are_learned_by_the_same_training(tmp_path: Path) -> None:
+    task = two_blocks((0.4, 0.15))
+    model = Identified(scene=TwoBlocks, dt=task.dt, learn={"mu": [0.05, 0.05]})
+    metrics = fit(model, task, epochs=60, optimizer=Optimizer(lbfgs_after=40), folder=tmp_path, trainer=QUIET).metrics
+    assert metrics is not None
+    assert metrics["mu_1_error"] <= 1e-7
+    assert metrics["mu_2_error"] <= 1e-7
+    assert metrics["stick_accuracy"] == 1.0
+    assert (tmp_path / "rollouts.png").is_file()
+    loaded = lcplearn.load(tmp_path / "best.ckpt")
+    assert loaded.physical_parameters() == model.physical_parameters()
+
+
+def test_a_spring_and_its_friction_are_learned_with_the_loop_closed(tmp_path: Path) -> None:
+    task = simulate_spring_block(trajectories=6, length=40, long_length=50)
+    model = Identified(
+        scene="lcplearn.scenes.spring_block.SpringBlock",
+        dt=task.dt,
+        given=task.given,
+        learn={"stiffness": 10.0, "mu": 0.05},
+    )
+    fitted = fit(model, task, loss={"rollout": 1.0}, horizon=10, epochs=80, optimizer=Optimizer(lbfgs_after=60),
+                 folder=tmp_path, trainer=QUIET)  # fmt: skip
+    assert fitted.metrics is not None
+    assert fitted.metrics["stiffness_error"] <= 1e-5
+    assert fitted.metrics["mu_error"] <= 1e-7
+
+
+def test_a_pulled_spring_holds_still_within_friction_and_swings_about_its_true_frequency() -> None:
+    """Friction mu m g holds stretches up to mu m g / k; without it the period is 2 pi sqrt(m / k)."""
+    still = SpringBlock(mass=1.0, mu=0.5, stiffness=10.0, dt=0.01)
+    reach = 0.5 * 9.81 / 10.0
+    for share, sticks in ((0.99, True), (1.01, False)):
+        after = still.step(torch.tensor([share * reach, 0.0], dtype=torch.float64), torch.zeros(1).double())
+        assert (after[1] == 0.0) == sticks
+    free = SpringBlock(mass=1.0, mu=0.0, stiffness=(2 * torch.pi) ** 2, dt=1e-3)
+    path = free.rollout(torch.tensor([1.0, 0.0], dtype=torch.float64), torch.zeros(1000, 1).double())
+    crossings = torch.nonzero(path.positions[:-1, 0] * path.positions[1:, 0] < 0).flatten() * 1e-3
+    assert crossings.tolist() == pytest.approx([0.25, 0.75], abs=2e-3)
+
+
+def test_numbers_stay_in_the_domain_that_the_scene_declares() -> None:
+    model = Identified(scene=BouncingBlock, dt=0.1, learn={"mass": 2.0, "restitution": 0.5, "gravity": 9.81})
+    assert model.physical_parameters() == pytest.approx({"mass": 2.0, "restitution": 0.5, "gravity": 9.81})
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter -= 30.0
+    found = model.physical_parameters()
+    assert found["mass"] > 0
+    assert 0 < found["restitution"] < 1
+    assert found["gravity"] == pytest.approx(-20.19)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"learn": {"mue": 0.1}}, r"^learn: expected numbers of SlidingBlock \(mass, mu, gravity\), got mue"),
+        ({"learn": {}}, "^learn: expected numbers"),
+        (
+            {"learn": {"mu": 0.0}, "given": {"mass": 1.0}},
+            r"^learn\.mu: expected a number of at least 0, inside its bounds, got 0\.0",
+        ),
+        ({"learn": {"mu": 0.1}}, r"^given: expected mass of SlidingBlock, got none"),
+        ({"learn": {"mu": 0.1}, "scene": "lcplearn.scenes.Nothing"}, "^scene: expected the dotted name of a class"),
+        ({"learn": {"mu": 0.1}, "scene": Formulation}, "^scene: expected a dataclass"),
+    ],
+)
+def test_a_wrong_argument_is_named(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Identified(**({"scene": SlidingBlock, "dt": 0.1} | arguments))
+    with pytest.raises(TypeError, match=r"^Physical: expected keyword arguments only, got 0\.05 without a name"):
+        Physical(0.05)
+
+
+class Deaf(MLP):
+    """Has a number that no prediction depends on."""
+
+    def __init__(self, *, dt: float) -> None:
+        super().__init__(dt=dt)
+        self.stiffness = torch.nn.Parameter(torch.ones((), dtype=torch.float64))
+
+
+def test_a_number_that_the_loss_does_not_depend_on_is_refused_before_training(tmp_path: Path) -> None:
+    task = simulate_sliding_block(trajectories=2, length=5, long_length=5)
+    with pytest.raises(ValueError, match=r"^model: expected a loss \(prediction\) that depends on .* got no stiffness"):
+        fit(Deaf(dt=task.dt), task, folder=tmp_path / "run", trainer=QUIET)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_checkpoint_from_before_identified_still_loads(tmp_path: Path) -> None:
+    """It names the old module, and has the logarithms of mu and of a mass that was not learned."""
+    state = {"model.log_mu": torch.tensor(0.25).double().log(), "model.log_mass": torch.tensor(2.0).double().log()}
+    for learn_mass, expected in ((True, {"mu": 0.25, "mass": 2.0}), (False, {"mu": 0.25})):
+        arguments = {"dt": 0.1, "gravity": 9.81, "initial_mass": 2.0, "learn_mass": learn_mass}
+        saved = {"class": "lcplearn.formulations.structured.Physical", "arguments": arguments}
+        torch.save({"formulation": saved, "state_dict": state}, tmp_path / "old.ckpt")
+        assert lcplearn.load(tmp_path / "old.ckpt").physical_parameters() == pytest.approx(expected)
