@@ -151,7 +151,7 @@ def test_gradient_at_a_coupled_kink_is_one_of_the_one_sided_derivatives(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("p", "expected"), [(0.3, 0.0), (-0.2, 0.0), (0.9, 1.0), (-0.7, 1.0)])
 def test_velocity_gradient_of_the_friction_problem_is_exact_although_its_forces_are_not_unique(method, p, expected):
-    """Errata 24: at stick the basis block is singular for an interior point; dv/dp = 0 there and 1 in slip."""
+    """NOTES 5.6: at stick the basis block is singular for an interior point; dv/dp = 0 there and 1 in slip."""
     p = torch.tensor(p).requires_grad_()
     z = solve_lcp(torch.tensor(FRICTION), torch.stack([p, -p, torch.tensor(0.4)]), method=method).z
     velocity = p + z[0] - z[1]

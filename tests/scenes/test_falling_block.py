@@ -1,4 +1,4 @@
-"""The claims of LCP Notes 1 on a falling block, and of the errata on impact and restitution."""
+"""The claims of NOTES 5.1 and 5.2 on a falling block, its impact and restitution."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def drop(block, height: float, steps: int, velocity: float = 0.0, dtype: torch.d
     dt=st.floats(1e-3, 0.2),
 )
 def test_a_step_satisfies_the_equations_of_motion_and_the_contact_conditions(height, velocity, force, mass, dt):
-    """Notes 1, the first two equations with general mass, and 0 <= x ⟂ lambda >= 0."""
+    """NOTES 5.1, the first two equations with general mass, and 0 <= x ⟂ lambda >= 0."""
     block = FallingBlock(mass, dt)
     x, v, u = (torch.tensor(value, dtype=torch.float64) for value in (height, velocity, force))
     contact = solve_lcp(*block.lcp(x, v, u), method="diagonal").w[0]
@@ -42,7 +42,7 @@ def test_a_step_satisfies_the_equations_of_motion_and_the_contact_conditions(hei
 
 @pytest.mark.parametrize("dt", [0.1, 0.01])
 def test_energy_changes_by_the_contact_work_less_half_the_squared_velocity_change(dt):
-    """Errata, falling block: dE = lambda dt v' - (v' - v)^2 / 2 for unit mass, and contact never adds energy."""
+    """NOTES 5.1: dE = lambda dt v' - (v' - v)^2 / 2 for unit mass, and contact never adds energy."""
     block = FallingBlock(1.0, dt)
     x, v, _ = drop(block, 1.0, 100)
     contact = solve_lcp(*block.lcp(x[:-1], v[:-1], torch.zeros_like(x[:-1])), method="diagonal").w[:, 0]
@@ -55,7 +55,7 @@ def test_energy_changes_by_the_contact_work_less_half_the_squared_velocity_chang
 
 @pytest.mark.parametrize(("dt", "mass"), [(0.1, 1.0), (0.01, 3.0)])
 def test_each_step_of_free_flight_loses_the_same_energy(dt, mass):
-    """Errata, falling block: m g^2 dt^2 / 2 a step, from implicit Euler."""
+    """NOTES 5.1: m g^2 dt^2 / 2 a step, from implicit Euler."""
     x, v, mode = drop(FallingBlock(mass, dt), 1.0, 20)
     energy = mass * (v**2 / 2 + GRAVITY * x)
     flight = mode == Mode.SEPARATION
@@ -64,7 +64,7 @@ def test_each_step_of_free_flight_loses_the_same_energy(dt, mass):
 
 
 def test_energy_lost_before_impact_shrinks_with_the_step_size():
-    """Errata, falling block: 19.6, 6.2, 2.2, 0.22 % of a fall from 1 m for dt = 0.1, 0.03, 0.01, 0.001."""
+    """NOTES 5.1: 19.6, 6.2, 2.2, 0.22 % of a fall from 1 m for dt = 0.1, 0.03, 0.01, 0.001."""
     for dt, expected in ((0.1, 0.196), (0.03, 0.062), (0.01, 0.022), (0.001, 0.0022)):
         x, v, mode = drop(FallingBlock(1.0, dt), 1.0, int(0.5 / dt) + 2)
         last = int((mode == Mode.SEPARATION).sum())
@@ -73,7 +73,7 @@ def test_energy_lost_before_impact_shrinks_with_the_step_size():
 
 
 def test_impact_takes_two_steps_and_then_the_ground_carries_the_weight():
-    """Errata, falling block: gap exactly 0 with v = -x_k/dt, then v exactly 0; impulse |v_in| + 2 g dt (unit mass)."""
+    """NOTES 5.1: gap exactly 0 with v = -x_k/dt, then v exactly 0; impulse |v_in| + 2 g dt (unit mass)."""
     dt = 0.01
     block = FallingBlock(1.0, dt)
     x, v, mode = drop(block, 1.0, 100)
@@ -91,7 +91,7 @@ def test_impact_takes_two_steps_and_then_the_ground_carries_the_weight():
 
 
 def test_a_block_pulled_up_harder_than_its_weight_leaves_the_ground():
-    """Notes 1: only a gap ends the contact force."""
+    """NOTES 5.1: only a gap ends the contact force."""
     block = FallingBlock(2.0, 0.1)
     rest = torch.zeros(2, dtype=torch.float64)
     for force, leaves in ((2.0 * GRAVITY - 0.1, False), (2.0 * GRAVITY + 0.1, True)):
@@ -100,7 +100,7 @@ def test_a_block_pulled_up_harder_than_its_weight_leaves_the_ground():
 
 
 def test_a_bouncing_block_peaks_at_the_restitution_squared():
-    """Errata, restitution: peaks of a fall from 1 m near e^2, e^4, e^6, and no penetration beyond g dt^2."""
+    """NOTES 5.2: peaks of a fall from 1 m near e^2, e^4, e^6, and no penetration beyond g dt^2."""
     dt = 1e-3
     restitution = torch.tensor([0.5, 0.8, 1.0], dtype=torch.float64)
     gaps, _, _ = drop(BouncingBlock(1.0, restitution, dt), 1.0, 2100)
@@ -112,7 +112,7 @@ def test_a_bouncing_block_peaks_at_the_restitution_squared():
 
 
 def test_a_block_without_restitution_does_not_rebound_in_either_law():
-    """Errata, restitution: the LCP on gaps has none, Moreau's law with e = 0 neither."""
+    """NOTES 5.2: the LCP on gaps has none, Moreau's law with e = 0 neither."""
     for block in (FallingBlock(1.0, 0.01), BouncingBlock(1.0, 0.0, 0.01)):
         _, v, _ = drop(block, 1.0, 100)
         assert (v <= 0).all()
@@ -136,7 +136,7 @@ def test_gravity_can_be_learned_from_free_flight_and_not_from_rest():
 
 
 def test_each_scene_has_one_row():
-    """Issue: 1, 1, 2, 2, 3 rows."""
+    """A gap, or a velocity in excess of the rebound: no more unknowns than the scene needs."""
     zero = torch.zeros(4, dtype=torch.float64)
     for M, q in (FallingBlock(1.0, 0.1).lcp(zero, zero, zero), BouncingBlock(1.0, 0.5, 0.1).lcp(zero, zero)):
         assert M.shape[-2:] == (1, 1)

@@ -1,4 +1,4 @@
-"""The claims of LCP Notes 2.1, 2.2 and 2.5 on sliding blocks, as the errata correct them."""
+"""The claims of NOTES 5.3 to 5.6 on sliding blocks."""
 
 import itertools
 import math
@@ -38,7 +38,7 @@ def paths(random_pushes) -> dict[str, Trajectory]:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_all_forms_give_the_closed_form_velocity_on_30000_random_steps(form, random_pushes, paths):
-    """Notes 2.5 against 2.2; NOTES 5.6. The mode has to agree too: sticking is exactly zero velocity."""
+    """NOTES 5.6. The mode has to agree too: sticking is exactly zero velocity."""
     start, forces = random_pushes
     path, velocity = paths[form], start[:, 1]
     for k in range(forces.shape[1]):
@@ -49,12 +49,12 @@ def test_all_forms_give_the_closed_form_velocity_on_30000_random_steps(form, ran
 
 
 def test_direct_equals_traditional_on_30000_random_steps(paths):
-    """Notes 2.5 against 2.2."""
+    """NOTES 5.6 against 5.4."""
     assert (paths["direct"].velocities - paths["traditional"].velocities).abs().max() <= 1e-12
 
 
 def test_the_two_velocities_are_complementary_on_30000_random_steps(random_pushes, paths):
-    """Lemma 2.1."""
+    """NOTES 5.4: complementarity of v+ and v-."""
     before = paths["direct"].velocities[:, :-1, 0]
     z = solve_lcp(*block().lcp(before, random_pushes[1][..., 0]), method="diagonal").z
     assert (z >= 0).all()
@@ -64,14 +64,14 @@ def test_the_two_velocities_are_complementary_on_30000_random_steps(random_pushe
 @settings(deadline=None)
 @given(plus=positive, minus=positive, force=signed, dt=st.floats(1e-4, 5), mu=st.floats(0, 2))
 def test_the_velocities_become_complementary_even_after_ones_that_were_not(plus, minus, force, dt, mu):
-    """Lemma 2.1 needs no induction hypothesis, errata 12: only v+ - v- enters the LCP."""
+    """No induction hypothesis is needed: only v+ - v- enters the LCP."""
     start = torch.tensor(plus, dtype=torch.float64) - torch.tensor(minus, dtype=torch.float64)
     z = solve_lcp(*block(dt=dt, mu=mu).lcp(start, torch.tensor(force, dtype=torch.float64)), method="diagonal").z
     assert z[0] * z[1] == 0
 
 
-def test_the_lemma_fails_for_a_negative_friction_coefficient():
-    """Errata 12: with |p| < -c both velocities are positive."""
+def test_velocities_are_not_complementary_for_a_negative_friction_coefficient():
+    """With |p| < -c both velocities are positive."""
     zero = torch.zeros((), dtype=torch.float64)
     z = solve_lcp(*block(mu=torch.tensor(-0.4, dtype=torch.float64)).lcp(zero, zero), method="diagonal").z
     assert (z > 0).all()
@@ -80,7 +80,7 @@ def test_the_lemma_fails_for_a_negative_friction_coefficient():
 @settings(deadline=None)
 @given(velocity=st.floats(0, 1e3), force=st.floats(0, 1e3), mu=st.floats(0, 2), mass=positive, dt=st.floats(1e-3, 1))
 def test_one_way_friction_never_pushes_a_block_that_is_not_pulled_back(velocity, force, mu, mass, dt):
-    """Remark 1: lambda = mu m g - w >= 0 for v_k >= 0 and u >= 0."""
+    """NOTES 5.3: lambda = mu m g - w >= 0 for v_k >= 0 and u >= 0."""
     one_way = OneWayBlock(mass, mu, dt)
     v, u = torch.tensor(velocity, dtype=torch.float64), torch.tensor(force, dtype=torch.float64)
     solution = solve_lcp(*one_way.lcp(v, u), method="diagonal")
@@ -90,7 +90,7 @@ def test_one_way_friction_never_pushes_a_block_that_is_not_pulled_back(velocity,
 
 
 def test_one_way_friction_holds_the_block_against_any_backward_force():
-    """Errata 4: outside the condition of Remark 1, lambda is negative and the velocity still 0."""
+    """NOTES 5.3: pulled back, lambda is negative and the velocity still 0."""
     one_way = OneWayBlock(MASS, MU, DT)
     v, u = torch.tensor(0.0, dtype=torch.float64), torch.tensor(-100.0, dtype=torch.float64)
     solution = solve_lcp(*one_way.lcp(v, u), method="diagonal")
@@ -101,14 +101,14 @@ def test_one_way_friction_holds_the_block_against_any_backward_force():
 @settings(deadline=None)
 @given(velocity=st.floats(0, 1e3), force=signed)
 def test_one_way_block_has_its_closed_form(velocity, force):
-    """Notes 2.1."""
+    """NOTES 5.3."""
     one_way = OneWayBlock(MASS, MU, DT)
     v, u = torch.tensor(velocity, dtype=torch.float64), torch.tensor(force, dtype=torch.float64)
     torch.testing.assert_close(one_way.next_velocity(v, u), one_way.closed_form(v, u), rtol=1e-13, atol=1e-12)
 
 
 def test_a_one_way_block_slows_down_under_friction_and_stops():
-    """Notes 2.1: mu g dt of velocity a step, then none."""
+    """NOTES 5.3: mu g dt of velocity a step, then none."""
     path = OneWayBlock(MASS, MU, DT).rollout(
         torch.tensor([0.0, 0.5], dtype=torch.float64), torch.zeros(5, 1, dtype=torch.float64)
     )
@@ -121,7 +121,7 @@ def test_a_one_way_block_slows_down_under_friction_and_stops():
 @settings(deadline=None)
 @given(velocity=signed, force=signed, mu=st.floats(0, 2), mass=positive, dt=st.floats(1e-3, 1))
 def test_direct_friction_forces_add_up_to_minus_the_speed(velocity, force, mu, mass, dt):
-    """Errata 5: lambda+ + lambda- = -|v_{k+1}| m/dt, so that one of the two is fictitious in motion."""
+    """NOTES 5.4: lambda+ + lambda- = -|v_{k+1}| m/dt, so that one of the two is fictitious in motion."""
     v, u = torch.tensor(velocity, dtype=torch.float64), torch.tensor(force, dtype=torch.float64)
     solution = solve_lcp(*block(mu=mu, mass=mass, dt=dt).lcp(v, u), method="diagonal")
     limit = mu * mass * GRAVITY
@@ -132,7 +132,7 @@ def test_direct_friction_forces_add_up_to_minus_the_speed(velocity, force, mu, m
 
 
 def test_the_slack_of_the_physical_form_is_that_of_the_physical_friction(random_pushes, paths):
-    """Errata 15: w = (mu m g + F, mu m g - F) with F from the equation of motion, |F| <= mu m g."""
+    """NOTES 5.5: w = (mu m g + F, mu m g - F) with F from the equation of motion, |F| <= mu m g."""
     force = random_pushes[1][..., 0]
     before, after = paths["physical"].velocities[:, :-1, 0], paths["physical"].velocities[:, 1:, 0]
     friction = (after - before) * MASS / DT - force
@@ -152,7 +152,7 @@ def test_a_mirrored_push_gives_the_mirrored_velocity(velocity, force, form):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_without_friction_momentum_grows_by_the_impulse(form, random_pushes):
-    """m v_{k+1} = m v_k + u dt for mu = 0, where gamma of 2.5 is not unique (errata 24)."""
+    """m v_{k+1} = m v_k + u dt for mu = 0, where gamma of the traditional form is not unique (NOTES 5.6)."""
     start, forces = random_pushes
     path = block(form, mu=0.0).rollout(start[:20], forces[:20])
     momentum = MASS * start[:20, 1:2] + DT * forces[:20, :, 0].cumsum(dim=1)
@@ -166,7 +166,7 @@ def minors(M: torch.Tensor) -> list[float]:
 
 @pytest.mark.parametrize(("mass", "dt"), [(1.0, 1.0), (1.5, 0.05), (0.01, 2.0)])
 def test_the_traditional_matrix_is_semidefinite_but_not_a_p_matrix(mass, dt):
-    """Errata 22 and 23: minors 1 1 0, 0 1 1, 4 (for a = 1); symmetric part with eigenvalues 0, 0, 2a."""
+    """NOTES 5.6: minors 1 1 0, 0 1 1, 4 (for a = 1); symmetric part with eigenvalues 0, 0, 2a."""
     a = dt / mass
     zero = torch.zeros((), dtype=torch.float64)
     M, q = block("traditional", mass=mass, dt=dt).lcp(zero, zero)
@@ -177,7 +177,7 @@ def test_the_traditional_matrix_is_semidefinite_but_not_a_p_matrix(mass, dt):
 
 
 def test_sticking_friction_is_not_unique_in_the_traditional_form_but_velocity_is():
-    """Errata 24: all (lambda+, lambda-) with the right difference and a sum up to the limit solve the LCP."""
+    """NOTES 5.6: all (lambda+, lambda-) with the right difference and a sum up to the limit solve the LCP."""
     v, u = torch.tensor(0.0, dtype=torch.float64), torch.tensor(0.5 * LIMIT, dtype=torch.float64)
     M, q = block("traditional").lcp(v, u)
     for extra in (0.0, 0.1 * LIMIT, 0.25 * LIMIT):  # 0.25 = (mu m g - |p|/a) / 2, the end of the interval
