@@ -21,7 +21,7 @@ from lcplearn.lcp.residuals import EPS, equilibrate, judge, multiply, two_sided_
 
 DEFAULT_MAX_ITER = 100
 ROUND = 4  # iterations between two tries of the basis
-ROUNDS_AT_ONCE = 3  # before an accelerator is asked who is left: 0.4 % at most of ten families, see docs/devices.md
+ROUNDS_AT_ONCE = 3  # before an accelerator is asked who is left (docs/devices.md)
 EXACT = 16 * EPS
 CONVERGED = 50 * EPS
 NOISE = 64 * EPS  # of the terms that a w is the sum of: smaller ones are zero
@@ -90,14 +90,15 @@ def interior_point(
         for _ in range(1 if q.is_cpu else ROUNDS_AT_ONCE):
             some_path, some_best = _run_round(part, some_path, some_best, max_iter, smoothing > 0)
         path, best = _put(path, index, some_path), _put(best, index, some_best)
-        left = torch.nonzero(some_best.error > EXACT).squeeze(-1)  # if none is, the only question
+        going = (some_best.error > EXACT) & some_path.active & (some_path.iterations < max_iter)
+        left = torch.nonzero(going).squeeze(-1)
         index, part = index[left], _take(part, left)
         some_path, some_best = _take(some_path, left), _take(some_best, left)
-        if not (some_path.active & (some_path.iterations < max_iter)).any():
-            break
-    if len(index) and not smoothing:
+    if not smoothing:
+        rough = torch.nonzero(best.error > EXACT).squeeze(-1)
+        part, some_path, some_best = _take(problem, rough), _take(path, rough), _take(best, rough)
         some_best = _better(part, some_best, some_path.z, some_path.z > some_path.w)
-        best = _put(best, index, _rescue(part, some_best))
+        best = _put(best, rough, _rescue(part, some_best))
     return _in_units_of_caller(problem, path, best, max_iter)
 
 
