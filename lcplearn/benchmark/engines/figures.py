@@ -44,7 +44,7 @@ def error_time(scene: StickScene, rows: Sequence[Row]) -> "Figure":
     figure, axes = new_figure(1, 2, width=9.0, height=4.2)
     panels = (("step_us", "one scene alone"), ("many_us", "one scene of a batch of 256"))
     for ax, (column, title) in zip(axes[0], panels, strict=True):
-        for name in dict.fromkeys(str(row["engine"]) for row in rows):
+        for name in _names(rows):
             own = [row for row in rows if row["engine"] == name]
             x = [1e-6 * float(row[column]) / float(row["dt"]) for row in own]
             y = [max(float(row["position_error"]), FLOOR) for row in own]
@@ -62,7 +62,7 @@ def margin_lines(rows: Sequence[Row], held: float) -> "Figure":
     """Creep of a pushed block against what friction could hold over the push."""
     figure, axes = new_figure(width=7.0, height=4.6)
     ax = axes[0, 0]
-    for name in dict.fromkeys(str(row["engine"]) for row in rows):
+    for name in _names(rows):
         own = [row for row in rows if row["engine"] == name]
         margins = [float(re.sub(r".*margin ", "", str(row["scene"]))) for row in own]
         _line(ax, name, margins, [max(float(row["creep_um_s"]), FLOOR) for row in own])
@@ -71,6 +71,11 @@ def margin_lines(rows: Sequence[Row], held: float) -> "Figure":
     _mark_zero(ax)
     one_legend(figure, axes, columns=4)
     return figure
+
+
+def _names(rows: Sequence[Row]) -> list[str]:
+    found = {row["engine"] for row in rows}
+    return [name for name in LOOKS if name in found]
 
 
 def _line(ax: "Axes", name: str, x: Sequence[float], y: Sequence[float]) -> None:
