@@ -19,6 +19,7 @@ from lcplearn.benchmark.harness.figures import (
     Style,
     new_figure,
     one_legend,
+    whole_decades,
 )
 from lcplearn.benchmark.harness.study import Row
 
@@ -31,12 +32,13 @@ LOOKS = {
     "lcplearn body": Style(SKY, "s", "--"),
     "MuJoCo": Style(RED, "v", ":"),
     "MuJoCo elliptic": Style(ORANGE, "^", "-."),
-    "MuJoCo tuned": Style(PINK, "D"),
+    "MuJoCo noslip": Style(PINK, "D", "--"),
+    "MuJoCo stiff": Style(PINK, "h"),
     "Drake": Style(YELLOW, "P", ":"),
     "Drake tuned": Style(GREEN, "X"),
     "Drake TAMSI": Style(BLACK, "p", "--"),
 }
-FLOOR = 1e-17  # drawn in place of exactly 0 [m] or [um/s]
+FLOOR = 1e-21  # drawn in place of exactly 0 [m] or [um/s]
 
 
 def error_time(scene: StickScene, rows: Sequence[Row]) -> "Figure":
@@ -47,9 +49,10 @@ def error_time(scene: StickScene, rows: Sequence[Row]) -> "Figure":
         for name in _names(rows):
             own = [row for row in rows if row["engine"] == name]
             x = [1e-6 * float(row[column]) / float(row["dt"]) for row in own]
-            y = [max(float(row["position_error"]), FLOOR) for row in own]
+            y = [float(row["position_error"]) or FLOOR for row in own]
             _line(ax, name, x, y)
         ax.set(xscale="log", yscale="log", xlabel="CPU time of a simulated second [s]")
+        whole_decades(ax, "x")
         ax.set_title(title, fontsize=10)
         _mark_zero(ax)
     axes[0, 0].set_ylabel("largest position error [m]")
@@ -65,7 +68,7 @@ def margin_lines(rows: Sequence[Row], held: float) -> "Figure":
     for name in _names(rows):
         own = [row for row in rows if row["engine"] == name]
         margins = [float(re.sub(r".*margin ", "", str(row["scene"]))) for row in own]
-        _line(ax, name, margins, [max(float(row["creep_um_s"]), FLOOR) for row in own])
+        _line(ax, name, margins, [float(row["creep_um_s"]) or FLOOR for row in own])
     ax.set(xscale="log", yscale="log", xlabel="margin: friction limit over push [-]", ylabel="creep [µm/s]")
     ax.set_title("a block that friction holds, dt = 2 ms", fontsize=10)
     _mark_zero(ax)
@@ -86,8 +89,10 @@ def _line(ax: "Axes", name: str, x: Sequence[float], y: Sequence[float]) -> None
 
 
 def _mark_zero(ax: "Axes") -> None:
-    """A line where exactly 0 is drawn."""
+    """A line where exactly 0 is drawn, if something is."""
+    if not any(np.any(np.asarray(line.get_ydata()) == FLOOR) for line in ax.get_lines()):
+        return
     ax.axhline(FLOOR, color="0.6", linewidth=0.8)
     ax.annotate("exactly 0", (0.99, FLOOR), (0, 3), xycoords=("axes fraction", "data"), textcoords="offset points",
                 ha="right", fontsize=8, color="0.4")  # fmt: skip
-    ax.set_ylim(bottom=FLOOR / 5)
+    ax.set_ylim(FLOOR / 10, max(ax.get_ylim()[1], 1e-3))

@@ -20,7 +20,7 @@ from lcplearn.benchmark.engines.cases import (
 )
 from lcplearn.benchmark.engines.engine import Path
 
-_STIFFNESS = 1e6  # [1/s^2] of the ball's contact, where it is given directly to have a restitution
+_CONTACT = 0.3  # time step over that of the spring that gives the ball its restitution: a bounce takes ten steps
 
 
 class Settings(NamedTuple):
@@ -52,8 +52,9 @@ def _solref(scene: StickScene, dt: float, settings: Settings) -> str:
         return ""
     if scene.kind == "ball":  # stiffness and damping of a spring that gives back so much of the speed
         log = np.log(RESTITUTION)
-        damping = 2.0 * np.sqrt(_STIFFNESS) * -log / np.sqrt(np.pi**2 + log**2)
-        return f'solref="{-_STIFFNESS} {-float(damping)!r}"'
+        stiffness = (_CONTACT / dt) ** 2
+        damping = 2.0 * float(np.sqrt(stiffness) * -log / np.sqrt(np.pi**2 + log**2))
+        return f'solref="{-stiffness!r} {-damping!r}"'
     return f'solref="{2 * dt!r} 1"'
 
 

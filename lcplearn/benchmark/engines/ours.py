@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from lcplearn.scenes.contact import Contacts, contact_step
 from lcplearn.scenes.planar_block import PlanarBlock
 from lcplearn.scenes.planar_body import PlanarBody, PlanarStack, rectangle
 from lcplearn.scenes.scene import Drive, Step
-from lcplearn.scenes.space import LINE, Space, rotation_matrix
+from lcplearn.scenes.space import rotation_matrix
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
 GRAVITY = 9.81  # [m/s^2]
@@ -185,7 +185,7 @@ def _joint(scene: StickScene, dt: float) -> Setup:
         zero = torch.zeros_like(states[:, 0])
         return Reading(torch.stack((ARM * states[:, 0], zero, zero), -1), 0.5 * inertia * states[:, 1].square(), zero)
 
-    return Setup(lambda mu: _OnALine(SlidingBlock(inertia, mu / (inertia * GRAVITY), dt)), _row(0.0, 0.0),
+    return Setup(lambda mu: SlidingBlock(inertia, mu / (inertia * GRAVITY), dt), _row(0.0, 0.0),
                  _row(0.0), _row(1.0), read)  # fmt: skip
 
 
@@ -198,7 +198,7 @@ def _ball(scene: StickScene, dt: float) -> Setup:
         energy = MASS * (0.5 * velocity.square() + GRAVITY * gap)
         return Reading(torch.stack((zero, zero, gap), -1), energy, torch.relu(-gap))
 
-    return Setup(lambda mu: _OnALine(BouncingBlock(mass=MASS, restitution=RESTITUTION, dt=dt)), _row(HEIGHT, 0.0),
+    return Setup(lambda mu: BouncingBlock(mass=MASS, restitution=RESTITUTION, dt=dt), _row(HEIGHT, 0.0),
                  _row(0.0), _row(1.0), read)  # fmt: skip
 
 
@@ -226,17 +226,6 @@ class FixedContacts:
         found = contact_step(contacts, velocity + self.dt * drive.force / self.mass, self.mass, self.dt)
         state = torch.cat((position + self.dt * found.velocity, found.velocity), dim=-1)
         return Step(state, found.mode, None, found.solved & found.settled)
-
-
-@dataclass(frozen=True)
-class _OnALine:
-    """A block of one dimension."""
-
-    block: Any
-    space: ClassVar[Space] = LINE
-
-    def advance(self, state: Tensor, drive: Drive) -> Step:
-        return Step(self.block.step(state, drive.force), torch.zeros(()))
 
 
 class OurSimulation:
