@@ -8,6 +8,8 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from lcplearn import LCPLayer, solve_lcp
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = [{}, {"method": "interior_point", "tol": 1e-9}, {"smoothing": 1e-3}, {"method": "diagonal"}]
 
 

@@ -13,6 +13,8 @@ from torch.utils.data import DataLoader
 
 from lcplearn import LCPLayer, solve_lcp
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of one core
 @pytest.mark.parametrize("start", ["fork", "spawn"])

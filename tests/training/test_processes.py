@@ -14,6 +14,8 @@ from lcplearn.datasets import Task, simulate_sliding_block
 from lcplearn.formulations import Physical
 from lcplearn.training import Optimizer
 
+pytestmark = pytest.mark.slow
+
 SHORT = ["trainer.max_epochs=3", "optimizer.lbfgs_after=2", *SMALL]
 TWO = ["trainer.strategy=ddp", "trainer.devices=2"]
 

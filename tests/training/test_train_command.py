@@ -15,6 +15,8 @@ from lcplearn.datasets import simulate_sliding_block
 from lcplearn.formulations import Physical
 from lcplearn.training import Optimizer
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_mistyped_setting_ends_in_one_sentence_without_torch(tmp_path: Path) -> None:
     code = "import runpy, sys; sys.argv = ['train.py', 'modle=relu']\ntry: runpy.run_path(%r, run_name='__main__')\n"
