@@ -79,10 +79,10 @@ FIRST = [
     Mutation("torch's gradient of an unsolved element is not zero", LCP + "gradient.py",
              "(torch.where(solved, x, 0.0) for x in (grad_z, grad_w, z))", "(x for x in (grad_z, grad_w, z))",
              GRADIENT, "not_solved"),
-    Mutation("the kernel's judge accepts 1e-3", LCP + "pivoting.py", "max(tol, min(1e-6,", "max(tol, min(1e-3,",
+    Mutation("the kernel's judge accepts 1e-3", LCP + "kernel/judging.py", "max(tol, min(1e-6,", "max(tol, min(1e-3,",
              "tests/lcp/test_residuals.py"),
-    Mutation("a certificate may be wrong by 1e-3", LCP + "pivoting.py", "proven and total <= 1e-12 * size",
-             "proven and total <= 1e-3 * size", "tests/lcp/test_solution.py tests/lcp/test_solve.py"),
+    Mutation("a certificate may be wrong by 1e-3", LCP + "kernel/lemke.py", "proven and total <= 1e-12 * size",
+             "proven and total <= 1e-3 * size", "tests/lcp/test_pivoting.py"),
     # Those that had been caught.
     Mutation("the adjoint has the wrong sign", LCP + "gradient.py", "rhs = -g_z - multiply(M.mT, h_I)",
              "rhs = g_z - multiply(M.mT, h_I)", GRADIENT, "finite_differences"),
@@ -136,7 +136,7 @@ FIRST = [
              PREDICT, "csv_prediction"),
     Mutation("the summary's worst residual is the best", LCP + "solution.py", "float(solved.max())",
              "float(solved.min())", "tests/lcp/test_solution.py"),
-    Mutation("nothing is proved to be infeasible", LCP + "pivoting.py", "proven = qu <= -margin * size",
+    Mutation("nothing is proved to be infeasible", LCP + "kernel/lemke.py", "proven = qu <= -margin * size",
              "proven = qu < -1e300 * size", "tests/lcp/test_solution.py"),
 ]
 

@@ -66,7 +66,7 @@ def solver_address() -> int:
     """Where the layer's compiled solver is."""
     M, q = torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
     pivoting.solve_batch(M, q, single_precision=False, max_iter=None)
-    return address_of(pivoting._solve_range)
+    return address_of(pivoting.solve_range)
 
 
 @compiled

@@ -265,10 +265,10 @@ def test_what_rounding_to_float32_makes_infeasible_is_not_called_so():
     assert solve(M, q, single_precision=True).status[0] == Status.INFEASIBLE
 
 
-def test_a_dual_that_violates_its_constraints_by_a_millionth_proves_nothing():
-    """M = [[1e-6, -1], [1, 1e-6]] is a P-matrix: solvable, though u = (1, 0) nearly has M'u <= 0."""
-    result = solve([[1e-6, -1.0], [0.0, 1e-6]], [-1.0, 0.0])
-    assert result.status[0] != Status.INFEASIBLE
+def test_a_dual_that_violates_its_constraints_a_little_proves_nothing():
+    """u = (1, 1) has M'u = (5e-12, 0), far below any pivot, and q.u < 0; yet z = (4e11, 4e11) solves this P-matrix."""
+    M, q = np.array([[1.0, -1.0], [5e-12 - 1.0, 1.0]]), np.array([-1.0, -1.0])
+    assert solve(M, q).status[0] != Status.INFEASIBLE
 
 
 def test_feasible_problem_without_solution_is_unsolved():

@@ -1,0 +1,227 @@
+"""The cascade of stages that each element of a batch runs down."""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from lcplearn.lcp.kernel.block_pivoting import block_pivoting, polish
+from lcplearn.lcp.kernel.interior_point import interior_point
+from lcplearn.lcp.kernel.jit import (
+    CAPPED,
+    DONE,
+    EPS,
+    INFEASIBLE,
+    LARGEST,
+    MAX_ITERATIONS,
+    NONFINITE_INPUT,
+    SOLVED,
+    STUCK,
+    TINY,
+    UNSOLVED,
+    entry,
+    jit,
+    jit_inline,
+)  # fmt: skip
+from lcplearn.lcp.kernel.judging import (
+    all_finite,
+    drop_noise,
+    equilibrate,
+    evaluate,
+    judge,
+    nonnegative,
+    rescale,
+    scale,
+)
+from lcplearn.lcp.kernel.lemke import lemke, prove_infeasible
+from lcplearn.lcp.kernel.memory import integers, matrix, pointer, vector
+from lcplearn.lcp.kernel.scales import solve_by_scale
+
+# The stages in their order. BLOCK is block pivoting, where it is faster than Lemke's method; IMPROVE the same from what
+# LEMKE found, unless the residual is that of rounding. Then rows and columns are scaled apart: block pivoting, Lemke's
+# method, the same with an irregular covering vector, and with a finer pivot tolerance. PATH is the interior point, and
+# REFINED its solution refined, unless the residual is that of rounding: at a singular basis that can make it worse.
+# BY_SCALE goes one size of q down after the other from the best basis so far, ANEW from an empty one.
+BLOCK, LEMKE, IMPROVE, APART_BLOCK, APART_LEMKE, APART_COVER, APART_FINE, PATH, REFINED, BY_SCALE, ANEW = range(11)
+
+
+@jit
+def prepare_lemke(stage, single_precision, cover):
+    """Fill the covering vector and return the smallest pivot of a try: the size of the data's precision first.
+
+    The irregular vector is another path, without the old ray or cycle.
+    """
+    for i in range(cover.size):
+        cover[i] = 1.0 + (0.6180339887498949 * (i + 1)) % 1.0 if stage == APART_COVER else 1.0
+    precision = 1e-6 if single_precision else 1e-9
+    return precision * (100.0 if stage == APART_COVER else (1e-3 if stage == APART_FINE else 1.0))
+
+
+@jit_inline
+def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
+    """Put a scaled solution into the caller's arrays, with exact zeros; whether these hold it to full precision.
+
+    Where w is rounding noise it is zero too, and so are denormal z: S z has lost them, while M z would not.
+    """
+    smallest = TINY if s > 4.0 * TINY else 5e-324  # data that are all denormal may have a denormal solution
+    outside = 0
+    for i in range(z.size):
+        holds = basis[i] and z[i] >= TINY
+        z_out[i] = c[i] * s * z[i] if holds else 0.0
+        w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s / r[i]
+        basis_out[i] = basis[i] != 0
+        outside += not (z_out[i] <= LARGEST and w_out[i] <= LARGEST) or (holds and z_out[i] < smallest)
+    return outside == 0
+
+
+@jit_inline
+def next_stage(stage, capped, budget):
+    """A Lemke that is capped on the second scaling too, or a budget that is used up, leaves the interior point."""
+    return PATH if capped and stage < PATH and (budget >= 0 or stage >= APART_LEMKE) else stage + 1
+
+
+@jit_inline
+def run_stage(
+    stage, left, budget, tol, single_precision, q, S, A, T, d, r, c, s, p, cover, z, w, omega, x, y, v, buffer,
+    rows, cols, index, basic, basis, column, place, basis_out
+):  # fmt: skip
+    """Leave a candidate in z, w, omega and basis; how the stage ended, and its pivots or steps."""
+    n = q.size
+    ended, count = STUCK, 0
+    if stage == APART_BLOCK:
+        for i in range(n):
+            basis[i] = p[i] < 0.0
+    if stage in (BLOCK, IMPROVE, APART_BLOCK):
+        return block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left))
+    if stage < PATH:
+        pivot = prepare_lemke(stage, single_precision, cover)
+        cap = left if budget >= 0 else 10 * n + 50
+        ended, count = lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
+        polish(S, p, basis, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
+    elif stage == PATH:
+        count = interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, min(80, left))
+        for i in range(n):
+            basis[i] = z[i] > w[i]
+            z[i] = z[i] if basis[i] else 0.0
+        evaluate(S, p, z, w, omega)
+    elif stage == REFINED:
+        polish(S, p, basis, T, place, False, A, rows, cols, index, z, w, omega, x, y)
+    else:
+        for i in range(n):
+            basis[i] = basis_out[i] and stage == BY_SCALE
+        count = solve_by_scale(q, S, p, d, r, c, s, A, rows, cols, index, basic, basis, z, w, omega, x, y, tol, left)
+    return ended, count
+
+
+@jit_inline
+def solve_one(
+    M, q, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
+    rows, cols, index, basic, basis, column, place, z_out, w_out, basis_out, u_out
+):  # fmt: skip
+    """Run the cascade for one finite element with some q_i < 0; status, residual and iterations.
+
+    What is infeasible is found out when Lemke's method first ends on a ray.
+    """
+    n = q.size
+    best, used, accepted, capped, asked = np.inf, 0, False, False, False
+    s = scale(M, q, r, c, S, p)
+    stage = BLOCK - 1 if warm or n < 6 or n > 40 else BLOCK
+    while stage < ANEW and not (accepted and ((stage != LEMKE and stage != PATH) or best <= 1e-3 * tol)):
+        stage = next_stage(stage, capped, budget)
+        left = budget - used if budget >= 0 else 20 * n + 100
+        if left <= 0:
+            capped = True
+            break
+        if stage in (APART_BLOCK, PATH):
+            for i in range(n):
+                r[i] = c[i] = d[i]
+            if stage == APART_BLOCK:
+                rescale(M, r, c, x)
+            s = scale(M, q, r, c, S, p)
+        ended, count = run_stage(
+            stage, left, budget, tol, single_precision, q, S, A, T, d, r, c, s, p, cover, z, w, omega, x, y, v, buffer,
+            rows, cols, index, basic, basis, column, place, basis_out
+        )  # fmt: skip
+        used += count
+        if stage in (BLOCK, IMPROVE, APART_BLOCK):
+            if ended != DONE:
+                continue
+        elif stage < PATH:
+            capped = ended == CAPPED
+        residual, limit = np.inf, tol
+        for attempt in range(2):
+            residual, limit = judge(q, S, p, d, r, c, s, z, w, omega, tol)
+            if attempt == 1 or residual <= limit or not drop_noise(z, w, omega, S, tol):
+                break
+            evaluate(S, p, z, w, omega)
+        good = residual <= limit
+        if (good and not accepted) or (residual < best and (good or not accepted)):
+            holds = write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
+            best, accepted = residual if holds else np.inf, good and holds
+        if ended == STUCK and not asked and not accepted:
+            asked = True
+            margin = 1e-3 if single_precision else 1e-9  # rounding of the data to float32 proves nothing
+            if prove_infeasible(
+                M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, margin, 20 * n + 50
+            ):
+                u_out[:] = v
+                return INFEASIBLE, best, used
+    return (SOLVED if accepted else MAX_ITERATIONS if capped else UNSOLVED), best, used
+
+
+def _make(sources: str) -> Any:
+    def solve_range(
+        B, n, shared, M_at, q_at, tol, single_precision, budget, warm, scratch,
+        z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at
+    ):  # fmt: skip
+        """Run the cascade for each element; the number of UNSOLVED ones.
+
+        The last arguments are addresses of the fields of LCPSolution.
+        """
+        sources  # noqa: B018 - in the closure, for numba's cache
+        width = (n + 3) // 4 * 4  # whole vectors of 4 doubles
+        Ms, qs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(pointer(q_at, 0.0), (B, n))
+        S, A, T = matrix(scratch, 0, n, n), matrix(scratch, n * n, n, n), matrix(scratch, 2 * n * n, n + 2, width)
+        f = 2 * n * n + (n + 2) * width
+        d, p, cover = vector(scratch, f, n), vector(scratch, f + n, n), vector(scratch, f + 2 * n, n)
+        z, w, omega = vector(scratch, f + 3 * n, n), vector(scratch, f + 4 * n, n), vector(scratch, f + 5 * n, n)
+        y, v, r = vector(scratch, f + 6 * n, n), vector(scratch, f + 7 * n, n), vector(scratch, f + 8 * n, n)
+        c, x = vector(scratch, f + 9 * n, n), vector(scratch, f + 10 * n, n + 2)
+        buffer = vector(scratch, f + 11 * n + 2, width)
+        zs, ws = numba.carray(pointer(z_at, 0.0), (B, n)), numba.carray(pointer(w_at, 0.0), (B, n))
+        us, bases = numba.carray(pointer(u_at, 0.0), (B, n)), numba.carray(pointer(basis_at, False), (B, n))
+        residuals, statuses = numba.carray(pointer(residual_at, 0.0), (B,)), numba.carray(pointer(status_at, 0), (B,))
+        iterations = numba.carray(pointer(iterations_at, 0), (B,))
+        f += 11 * n + 2 + width
+        rows, cols, index = integers(scratch, f, n), integers(scratch, f + n, n), integers(scratch, f + 2 * n, n)
+        basic, basis = integers(scratch, f + 3 * n, n), integers(scratch, f + 4 * n, n)
+        column, place = integers(scratch, f + 5 * n, n + 1), integers(scratch, f + 6 * n + 1, 2 * n + 1)
+        # and that is all of it: at most 3 n^2 + 25 n + 13 numbers, as width <= n + 3
+        unsolved = 0
+        for b in range(B):
+            Mb, qb = Ms[0 if shared else b], qs[b]
+            for i in range(n):  # until a stage has a candidate
+                basis[i] = bases[b, i] if warm else qb[i] < 0.0
+                zs[b, i], ws[b, i], bases[b, i], us[b, i] = 0.0, 0.0, False, 0.0
+            residuals[b], statuses[b], iterations[b] = 0.0, SOLVED, 0
+            if not (all_finite(qb) and all_finite(Mb)):
+                zs[b], ws[b] = np.nan, np.nan
+                residuals[b], statuses[b] = np.inf, NONFINITE_INPUT
+                continue
+            if nonnegative(qb):
+                ws[b] = qb
+                continue
+            equilibrate(Mb, A, x, d)
+            for i in range(n):
+                r[i] = c[i] = d[i]
+            statuses[b], residuals[b], iterations[b] = solve_one(
+                Mb, qb, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
+                rows, cols, index, basic, basis, column, place, zs[b], ws[b], bases[b], us[b]
+            )  # fmt: skip
+            unsolved += statuses[b] == UNSOLVED
+        return unsolved
+
+    return solve_range
+
+
+solve_range = entry(_make)
