@@ -165,8 +165,10 @@ def test_changing_the_matrix_between_forward_and_backward_is_an_error():
 
 def test_without_numba_auto_warns_once_and_solves_by_interior_point(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "lcplearn.lcp.pivoting", raising=False)
+    for name in [name for name in sys.modules if name.startswith(("lcplearn.lcp.pivoting", "lcplearn.lcp.kernel"))]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.delattr(lcplearn.lcp, "pivoting", raising=False)
+    monkeypatch.delattr(lcplearn.lcp, "kernel", raising=False)
     M, q = problem()
     pivoting_kernel.cache_clear()
     try:
