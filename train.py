@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -43,6 +44,7 @@ def train(config: DictConfig) -> float:
     from lightning import seed_everything
     from lightning.pytorch.utilities import rank_zero_only
 
+    from lcplearn.datasets.pushes import PushData
     from lcplearn.formulations import build
     from lcplearn.training import TrainingDivergedError, TrainingInterrupted, fit
     from lcplearn.training.metrics import describe_model, format_table
@@ -50,6 +52,8 @@ def train(config: DictConfig) -> float:
     torch.set_num_threads(config.threads)
     seed_everything(config.seed, verbose=False)
     data = hydra.utils.instantiate(config.data, _convert_="all")
+    if isinstance(data, PushData):
+        return train_pushes(config, data, settings, run.runtime.output_dir)
     asked = hydra.utils.instantiate(config.model, _partial_=True, _convert_="all")
     model = build(asked.func, data, **asked.keywords)
     loss, trainer = dict(settings["loss"]), dict(settings["trainer"])
@@ -86,6 +90,23 @@ def train(config: DictConfig) -> float:
         print(f"\n{format_table(result.metrics)}" + (f"\n\nlearned: {learned}" if learned else ""))
         print(f"\nrun folder: {os.path.relpath(result.folder)}")
     return result.validation
+
+
+def train_pushes(config: DictConfig, data: Any, settings: dict[str, Any], folder: str) -> float:
+    """Models of pushes fit themselves: cross-validate one, and fit it to all pushes."""
+    import hydra.utils
+
+    from lcplearn.training.push_training import fit_pushes
+
+    thing = {"vertices": data.vertices.tolist(), "com": data.com.tolist(), "mass": data.mass}
+    model = hydra.utils.instantiate(config.model, **thing, _convert_="all")
+    logger = hydra.utils.instantiate(config.logger, _convert_="all")
+    progress = config.trainer.get("enable_progress_bar", True)
+    result = fit_pushes(model, data, folder=folder, logger=logger, settings=settings, progress=progress)
+    learned = ", ".join(f"{name} = {value:.4g}" for name, value in model.physical_parameters().items())
+    print(f"\npushes that were left out:\n{result.report}" + (f"\n\nlearned from all: {learned}" if learned else ""))
+    print(f"\nrun folder: {os.path.relpath(result.folder)}")
+    return result.metrics["deviation_mm"]
 
 
 def sentence(error: BaseException) -> str:

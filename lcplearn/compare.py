@@ -27,6 +27,7 @@ Value = float | None
 _SILENT = ("seed", "data.seed", "ckpt_path", "allow_changes", "logger.", "trainer.enable_progress_bar", "resumed.from")
 # The far error that a picture shows: the first of these that a run has.
 _FAR = {
+    "deviation_mm": "deviation of end poses [mm]",
     "stop_error_median_mm": "where a slide stops: median error [mm]",
     "rollout_rmse_1000": "error over 1000 steps [m/s]",
     "rollout_rmse_100": "error over 100 steps [m/s]",
@@ -231,8 +232,8 @@ def _figure(value: Any) -> Value:
 
 
 def _error(row: Row) -> float:
-    """What rows are sorted by: the error of stops, or else of one step."""
-    found = (row.values["stop_error_median_mm"], row.values["velocity_rmse"])
+    """What rows are sorted by: the error of end poses, of stops, or else of one step."""
+    found = (row.values["deviation_mm"], row.values["stop_error_median_mm"], row.values["velocity_rmse"])
     return next((value for value in found if value is not None), math.inf)
 
 

@@ -7,6 +7,9 @@ time step; models that need measured friction also read
 and `dt` [s]. `--score DATA`
 judges the model on recordings instead: cube_slides.npz, or an NPZ file with `dt` and the arrays of
 lcplearn.datasets.Recordings.
+
+A model of pushes is judged by `--score PUSHES.npz`, a file like planar_pushes.npz; `--output` is then an NPZ file of
+predictions, `post_pose` (pushes, 3) [m, m, rad] and `force` (pushes, 2) [N].
 """
 
 import argparse
@@ -26,6 +29,7 @@ from torch import Tensor
 from lcplearn.datasets import Task, read_all_cube_slides, read_recordings
 from lcplearn.datasets.files import find, positive_number, read_npz
 from lcplearn.formulations import Formulation
+from lcplearn.formulations.pushing import PushModel
 from lcplearn.scenes.scene import Mode, Trajectory
 from lcplearn.scenes.space import LINE, Space
 from lcplearn.training.checkpoint import load
@@ -200,6 +204,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _predict(options: argparse.Namespace) -> None:
     model = load(options.checkpoint, "cpu", trust=options.trust)
+    if isinstance(model, PushModel):
+        raise ValueError(f"{type(model).__name__} predicts pushes, not motion under forces: use --score PUSHES.npz.")
     state = None if options.state is None else torch.tensor(options.state, dtype=torch.float64)
     inputs = read_inputs(options.input, model.space)
     trajectory = predict(model, inputs, state)
@@ -223,6 +229,11 @@ def _score(options: argparse.Namespace) -> None:
     from lcplearn.training.writing import write_figures
 
     model = load(options.checkpoint, "cpu", trust=options.trust)
+    if isinstance(model, PushModel):
+        from lcplearn.training.push_scoring import score_pushes
+
+        print(score_pushes(model, options.score, options.output))
+        return
     metrics = evaluate(model, read_data(options.score, model))
     print(format_table(metrics))
     if options.output:

@@ -19,6 +19,7 @@ STUDIES = {
     "scenes": "what a scene-minimal LCP saves, and error against step size and time",
     "engines": "the Stick Bench: scenes with an exact answer, beside physics engines",
     "models": "learned formulations: error against time, samples and noise",
+    "pushes": "real pushes: gradients, times, how many a model needs, planning with a learned one",
     "overhead": "one problem a call, and memory",
     "devices": "problems a second on a CUDA device, beside the CPU kernel on all cores",
 }

@@ -1,18 +1,17 @@
 """Real pushes of a steel triangle by a robot's finger: where it stood, how the finger moved, where it ended."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
 from lcplearn.datasets.files import check_offsets, find, positive_number, read_npz
-from lcplearn.scenes.pushed_object import Push
+from lcplearn.scenes.pushes import Outcome, Push, Pushes, geometries
 
 FILE = "planar_pushes.npz"
 PROTOCOLS = ("known", "unseen_supports", "few")
@@ -21,52 +20,6 @@ _INPUTS = (
     "object_mass",
 )  # fmt: skip
 _OUTCOME = ("post_pose", "force", "force_offsets")
-
-
-class Pushes(NamedTuple):
-    """All that a model sees of pushes.
-
-    The end pose of one push is the start pose of the next in these recordings, so that their order tells the answer:
-    it is not here.
-
-    Attributes:
-        push: Start pose, and the straightened path of the finger.
-        points: The three support points in the object's frame [m]; NaN where the whole face bears.
-        surface: Name of the surface under each.
-    """
-
-    push: Push
-    points: Float[Tensor, "b 3 2"]
-    surface: tuple[str, ...]
-
-    def take(self, index: Sequence[int] | Tensor) -> "Pushes":
-        """Some of them, by index or mask."""
-        rows = torch.as_tensor(index)
-        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
-        surface = tuple(self.surface[k] for k in rows.tolist())
-        return Pushes(Push(*(part[rows] for part in self.push)), self.points[rows], surface)
-
-    @property
-    def whole_face(self) -> Bool[Tensor, " b"]:
-        """Where the object rests on its face and not on three points."""
-        return self.points.isnan().any(-1).any(-1)
-
-
-class Outcome(NamedTuple):
-    """What was recorded: how pushes ended.
-
-    Attributes:
-        pose: x [m], y [m], angle [rad] of the object's frame at the end.
-        force: Force on the object [N], world, mean over the second half of the recording's time.
-    """
-
-    pose: Float[Tensor, "b 3"]
-    force: Float[Tensor, "b 2"]
-
-    def take(self, index: Sequence[int] | Tensor) -> "Outcome":
-        """Some of them, by index or mask."""
-        rows = torch.as_tensor(index)
-        return Outcome(self.pose[rows], self.force[rows])
 
 
 class Split(NamedTuple):
@@ -99,6 +52,11 @@ class PushData:
     com: Float[Tensor, "2"]
     mass: float
     splits: tuple[Split, ...] = ()
+
+    def take(self, rows: Int[Tensor, " n"]) -> "PushData":
+        """Some of them, without splits."""
+        some = {"pushes": self.pushes.take(rows), "outcome": self.outcome.take(rows)}
+        return PushData(**{**vars(self), **some, "configuration": self.configuration[rows], "splits": ()})
 
 
 def read_pushes(
@@ -153,41 +111,35 @@ def read_pushes(
 def read_all_pushes(path: Path | str) -> PushData:
     """All pushes of a file, without splits: to score a model that is trained.
 
+    A file without end poses and forces can be predicted, and not scored: its outcome is NaN.
+
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It is not as described in data/README.md.
     """
-    arrays = read_npz(path, _INPUTS + _OUTCOME)
+    arrays = read_npz(path, _INPUTS, optional=_OUTCOME)
     arrays |= read_npz(path, ("config_support_points",), finite=False)  # NaN where the whole face bears
-    count, configurations = len(arrays["config"]), len(arrays["config_name"])
-    shapes = {
-        "config": (count,), "pre_pose": (count, 3), "post_pose": (count, 3), "config_surface": (configurations,),
-        "config_support_points": (configurations, 3, 2), "object_com": (2,),
-    }  # fmt: skip
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"{path}: {name}: expected shape {list(shape)}, got {list(arrays[name].shape)}")
-    for name in ("pusher", "force"):
-        if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or len(arrays[f"{name}_offsets"]) != count + 1:
-            raise ValueError(f"{path}: {name}: expected rows of 3 numbers for {count} pushes")
-        check_offsets(path, arrays[f"{name}_offsets"], len(arrays[name]))
-    config = arrays["config"].astype(np.int64)
-    if count == 0 or config.min() < 0 or config.max() >= configurations:
-        raise ValueError(f"{path}: config: expected numbers from 0 to {configurations - 1} for at least one push")
-    ends = np.array([straighten(rows[:, 1:]) for rows in _records(arrays, "pusher")])
-    push = Push(*(torch.from_numpy(part).to(torch.float64) for part in (arrays["pre_pose"], ends[:, 0], ends[:, 1])))
-    force = np.array([rows[rows[:, 0] >= rows[-1, 0] / 2.0, 1:].mean(0) for rows in _records(arrays, "force")])
+    config = _configurations(path, arrays)
+    ends = np.array([straighten(rows[:, 1:]) for rows in _records(path, arrays, "pusher")])
+    pose, force = np.full((len(config), 3), np.nan), np.full((len(config), 2), np.nan)
+    if all(name in arrays for name in _OUTCOME):
+        pose = arrays["post_pose"]
+        rows = _records(path, arrays, "force")
+        force = np.array([part[part[:, 0] >= part[-1, 0] / 2.0, 1:].mean(0) for part in rows])
+    pre_pose, start, end, post_pose, mean_force, points, vertices, com = (
+        torch.from_numpy(np.ascontiguousarray(array)).to(torch.float64)
+        for array in (
+            arrays["pre_pose"], ends[:, 0], ends[:, 1], pose, force, arrays["config_support_points"][config],
+            arrays["object_vertices"], arrays["object_com"],
+        )
+    )  # fmt: skip
     return PushData(
-        pushes=Pushes(
-            push,
-            torch.from_numpy(arrays["config_support_points"][config]).to(torch.float64),
-            tuple(str(arrays["config_surface"][k]) for k in config),
-        ),
-        outcome=Outcome(torch.from_numpy(arrays["post_pose"]).to(torch.float64), torch.from_numpy(force)),
+        pushes=Pushes(Push(pre_pose, start, end), points, tuple(str(arrays["config_surface"][k]) for k in config)),
+        outcome=Outcome(post_pose, mean_force),
         configuration=torch.from_numpy(config),
         names=tuple(str(name).partition("/")[0] for name in arrays["config_name"]),
-        vertices=torch.from_numpy(arrays["object_vertices"]).to(torch.float64),
-        com=torch.from_numpy(arrays["object_com"]).to(torch.float64),
+        vertices=vertices,
+        com=com,
         mass=positive_number(path, "object_mass", arrays["object_mass"]),
     )
 
@@ -203,12 +155,25 @@ def straighten(path: Float[NDArray, "n 2"]) -> Float[NDArray, "2 2"]:
     return middle + np.outer((points[[0, -1]] - middle) @ direction, direction)
 
 
-def geometries(points: Float[Tensor, "b 3 2"]) -> Int[Tensor, " b"]:
-    """Number of each push's support geometry: the same three points in any order, or the whole face."""
-    keys = [tuple(sorted(map(tuple, p.nan_to_num(-1.0).mul(1e6).round().tolist()))) for p in points]
-    numbers = {key: k for k, key in enumerate(dict.fromkeys(keys))}
-    return torch.tensor([numbers[key] for key in keys])
+def _configurations(path: Path | str, arrays: dict[str, NDArray]) -> NDArray:
+    """Number of each push's configuration, after checking all shapes."""
+    count, configurations = len(arrays["config"]), len(arrays["config_name"])
+    shapes = {
+        "config": (count,), "pre_pose": (count, 3), "post_pose": (count, 3), "config_surface": (configurations,),
+        "config_support_points": (configurations, 3, 2), "object_com": (2,),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if name in arrays and arrays[name].shape != shape:
+            raise ValueError(f"{path}: {name}: expected shape {list(shape)}, got {list(arrays[name].shape)}")
+    config = arrays["config"].astype(np.int64)
+    if count == 0 or config.min() < 0 or config.max() >= configurations:
+        raise ValueError(f"{path}: config: expected numbers from 0 to {configurations - 1} for at least one push")
+    return config
 
 
-def _records(arrays: dict[str, NDArray], name: str) -> list[NDArray]:
-    return np.split(arrays[name].astype(np.float64), arrays[f"{name}_offsets"][1:-1])
+def _records(path: Path | str, arrays: dict[str, NDArray], name: str) -> list[NDArray]:
+    rows, offsets = arrays[name], arrays[f"{name}_offsets"]
+    if rows.ndim != 2 or rows.shape[1] != 3 or len(offsets) != len(arrays["config"]) + 1:
+        raise ValueError(f"{path}: {name}: expected rows of 3 numbers for {len(arrays['config'])} pushes")
+    check_offsets(path, offsets, len(rows))
+    return np.split(rows.astype(np.float64), offsets[1:-1])

@@ -9,25 +9,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 import lcplearn
+from lcplearn.scenes.pushes import Push
 from lcplearn.scenes.pushing_lcp import Bearing, Touch, aligned_lcp, ellipsoid_lcp, polygon_lcp
 from lcplearn.scenes.scene import Mode
 
 SETTLED = 1e-9  # change of a support's velocity between two iterates, in units of the finger's
 DAMP_FROM = 4  # iterations; undamped, one in a hundred cycles
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-
-
-class Push(NamedTuple):
-    """What is done to an object: it stands at `pose`, and the finger's centre moves along a straight line.
-
-    Attributes:
-        pose: x [m], y [m], angle [rad] of the object's frame in the world.
-        start, end: First and last point of the finger [m], world.
-    """
-
-    pose: Float[Tensor, "b 3"]
-    start: Float[Tensor, "b 2"]
-    end: Float[Tensor, "b 2"]
 
 
 class Grip(NamedTuple):

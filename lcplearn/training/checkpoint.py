@@ -9,12 +9,13 @@ from typing import Any
 import torch
 
 from lcplearn.formulations import FORMULATIONS, Formulation
+from lcplearn.formulations.pushing import PushModel
 from lcplearn.scenes.space import Space
 
 PREFIX = "model."  # of the model's entries in the LightningModule's state
 
 
-def describe(model: Formulation) -> dict[str, Any]:
+def describe(model: Formulation | PushModel) -> dict[str, Any]:
     """Class and constructor arguments of a model, as plain values."""
     return {"class": _name(type(model)), "arguments": {k: _plain(value) for k, value in model.arguments.items()}}
 
@@ -43,7 +44,7 @@ def _restored(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {**arguments, "space": Space(**names, rotations=space["rotations"])}
 
 
-def load(path: str | Path, map_location: str | torch.device | None = None, *, trust: bool = False) -> Formulation:
+def load(path: str | Path, map_location: str | torch.device | None = None, *, trust: bool = False) -> Any:
     """Load a trained model, ready to predict.
 
     Only plain values are unpickled (`weights_only=True`). The model's class is imported by the name that stands in the
@@ -56,7 +57,7 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
         trust: Import whatever module the file names.
 
     Returns:
-        The model, in evaluation mode.
+        The model, a `Formulation` or a `PushModel`, in evaluation mode.
 
     Raises:
         ValueError: no such file, not a checkpoint of lcplearn, its class is missing, has changed or would have to be
@@ -75,7 +76,7 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
         cls = ours[name] if moved else getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"{path} was made with the class {module}.{name}, which can't be imported here.") from error
-    if not (isinstance(cls, type) and issubclass(cls, Formulation)):
+    if not (isinstance(cls, type) and issubclass(cls, Formulation | PushModel)):
         raise ValueError(f"{path} names the class {module}.{name}, which is not a Formulation.")
     state = {key.removeprefix(PREFIX): value for key, value in checkpoint["state_dict"].items()}
     wrong = [key for key, value in state.items() if not bool(torch.as_tensor(value).isfinite().all())]

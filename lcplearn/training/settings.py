@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
-FROM_DATA = {"dt", "gravity", "space", "given"}  # of a model, which takes them from its data
+FROM_DATA = {"dt", "gravity", "space", "given", "vertices", "com"}  # of a model, which takes them from its data
 UNLIKELY = {"min_epochs"}  # what nobody means who writes something alike
 # Ranges that the targets check too, seconds later: of data, model and optimizer.
 POSITIVE = {"dt", "mass", "trajectories", "length", "width", "initial_mass", "lr", "lbfgs_iterations", "shift"}
@@ -51,6 +51,7 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
     if not 0 <= settings["seed"] < 2**32:  # what NumPy's generator takes
         raise SettingsError(f"seed must be at least 0 and below 2^32, got {settings['seed']}.")
     _check_friction(settings)
+    _check_pushes(settings, conf)
     for group in ("data", "model", "optimizer", "logger"):
         if settings[group] or group != "logger":  # logger=none is empty
             _check_target(group, settings[group])
@@ -134,6 +135,24 @@ def _check_friction(settings: Mapping[str, Any]) -> None:
     if not settings["data"].get("friction"):
         kinds = "slack" if model == "Slack" else "physical or data.friction=lcp"
         raise SettingsError(f"model={model.lower()} needs friction labels: set data.friction={kinds}.")
+
+
+def _check_pushes(settings: Mapping[str, Any], conf: Path) -> None:
+    """Models of pushes learn from pushes, and from nothing else; they fit themselves, so that no loss can be chosen."""
+    models, data = (".pushing." in str(settings["model"].get("_target_")), settings["data"].get("_target_"))
+    pushes = str(data).endswith("read_pushes")
+    if models != pushes:
+        asked = "data=pushes needs a model of pushes" if pushes else "a model of pushes needs data=pushes"
+        raise SettingsError(f"{asked}: experiment=pushes_supports, pushes_residual, pushes_ridge, ...")
+    if not pushes:
+        return
+    for group, choice in (("loss", "prediction"), ("optimizer", "adam_lbfgs")):
+        content = yaml.safe_load((conf / group / f"{choice}.yaml").read_text())
+        if any(settings[group].get(key) != value for key, value in content.items() if key != "defaults"):
+            raise SettingsError(f"{group} can't be chosen with data=pushes: these models fit themselves.")
+    for key in ("batch_size", "ckpt_path"):
+        if settings.get(key) is not None:
+            raise SettingsError(f"{key} can't be set with data=pushes: a fit takes seconds and is done as a whole.")
 
 
 def _check_loss(loss: Mapping[str, Any], known: Iterable[str]) -> None:

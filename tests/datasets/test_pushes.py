@@ -6,7 +6,8 @@ import torch
 from pushes import push_arrays
 from real_data import real_data
 
-from lcplearn.datasets.pushes import geometries, read_all_pushes, read_pushes, straighten
+from lcplearn.datasets.pushes import read_all_pushes, read_pushes, straighten
+from lcplearn.scenes.pushes import geometries
 
 
 @pytest.fixture
@@ -92,7 +93,8 @@ def test_the_same_seed_draws_the_same_parts(file):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"post_pose": None}, "post_pose"),
+        ({"pusher": None}, "pusher"),
+        ({"post_pose": np.zeros((12, 2))}, "post_pose"),
         ({"pre_pose": np.zeros((12, 2))}, "pre_pose"),
         ({"config": np.full(12, 7)}, "config"),
         ({"pusher": np.zeros((10, 3))}, "offsets"),

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from lcplearn.scenes.pushed_object import Grip, Push, PushedObject, plane_fit, rotate
+from lcplearn.scenes.pushed_object import Grip, PushedObject, plane_fit, rotate
+from lcplearn.scenes.pushes import Push
 from lcplearn.scenes.scene import Mode
 
 F = torch.float64

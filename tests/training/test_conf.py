@@ -13,6 +13,7 @@ from training.helpers import ROOT
 from lcplearn.datasets import Task, simulate_sliding_block
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.formulations import FORMULATIONS, Formulation, build
+from lcplearn.formulations.pushing import PushModel
 from lcplearn.training import settings as checks
 from lcplearn.training.optimizer import Optimizer
 
@@ -36,6 +37,8 @@ def settings(*overrides: str) -> dict[str, Any]:
 EVERY = [f"{group}={name}" for group in ("model", "loss", "optimizer", "trainer", "logger") for name in names(group)]
 EVERY += [f"experiment={name}" for name in names("experiment")] + ["data=cube_slides model=mlp"]
 EVERY = [choice.replace("model=identified", "data=spring model=identified") for choice in EVERY]
+PUSHES = [choice for choice in EVERY if choice.startswith(("model=push_", "experiment=pushes_"))]
+EVERY = [choice for choice in EVERY if choice not in PUSHES]
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +59,17 @@ def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, 
     assert isinstance(instantiate(chosen["optimizer"], _convert_="all"), Optimizer)
 
 
+@pytest.mark.parametrize("choice", PUSHES)
+def test_every_model_of_pushes_passes_the_check_and_is_built(choice: str) -> None:
+    chosen = settings("data=pushes", choice)
+    checks.check(chosen, CONF)
+    triangle = {"vertices": [[0.0, 0.0], [0.15, 0.0], [0.0, 0.15]], "com": [0.05, 0.05], "mass": 1.5}
+    assert isinstance(instantiate(chosen["model"], **triangle, _convert_="all"), PushModel)
+
+
 def test_every_formulation_has_a_configuration() -> None:
-    targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in names("model")}
+    others = [name for name in names("model") if not name.startswith("push_")]
+    targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in others}
     assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified"}
 
 
@@ -101,6 +113,10 @@ def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
         ("ckpt_path=nope.ckpt", "ckpt_path=nope.ckpt is not a file; checkpoints are named runs/DATE_TIME/last.ckpt."),
         ("model=direct data.friction=null", "model=direct needs friction labels: set data.friction=physical"),
         ("data=cube_slides +data.friction=slack", "Unknown setting 'data.friction'"),
+        ("data=pushes", "data=pushes needs a model of pushes: experiment=pushes_supports"),
+        ("model=push_ridge", "a model of pushes needs data=pushes"),
+        ("experiment=pushes_mlp loss.prediction=2", "loss can't be chosen with data=pushes"),
+        ("experiment=pushes_mlp seed=1 ckpt_path=README.md", "ckpt_path can't be set with data=pushes"),
         ("data=cube_slides model=slack", "model=slack needs friction labels, which only data=sliding_block has."),
     ],
 )

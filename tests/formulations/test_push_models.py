@@ -1,0 +1,119 @@
+"""Models of pushes: what they learn from a known object, what they see, and what is left in their checkpoints."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from pushes import push_arrays
+from real_data import real_data
+
+from lcplearn.datasets.pushes import PushData, read_all_pushes
+from lcplearn.formulations.pushing import PushMLP, Residual, Ridge, Supports
+
+F = torch.float64
+
+
+def thing(data: PushData) -> dict:
+    return {"vertices": data.vertices.tolist(), "com": data.com.tolist(), "mass": data.mass}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("pushes") / "pushes.npz"
+    np.savez(path, **push_arrays(24))
+    return read_all_pushes(path)
+
+
+@pytest.fixture(scope="module")
+def known(data):
+    """Pushes of an object whose numbers are known, predicted by the mechanics themselves."""
+    model = Supports(**thing(data), surfaces=["board", "wood"])
+    with torch.no_grad():
+        model.numbers.copy_(torch.tensor((math.log(0.5), 1.2, 0.8)))
+        model.mu.copy_(torch.tensor((0.25, 0.4)))
+        end = model.predict(data.pushes)
+    return model, data.outcome._replace(pose=end.pose, force=end.force)
+
+
+def run(model, pushes, outcome):
+    for _ in model.fit(pushes, outcome):
+        pass
+    return model
+
+
+def test_supports_find_the_numbers_that_made_the_pushes(data, known):
+    """mu_c, height and rim from end poses; mu of each surface from forces."""
+    true, outcome = known
+    found = run(Supports(**thing(data)), data.pushes, outcome).physical_parameters()
+    for name, value in true.physical_parameters().items():
+        assert found[name] == pytest.approx(value, rel=0.02), name
+
+
+def test_mu_comes_from_the_force_alone(data, known):
+    _, outcome = known
+    doubled = outcome._replace(force=2.0 * outcome.force)
+    one, two = (
+        run(Supports(**thing(data), height=False), data.pushes, o).physical_parameters() for o in (outcome, doubled)
+    )
+    assert two["mu_board"] == pytest.approx(2.0 * one["mu_board"])
+    assert two["mu_c"] == pytest.approx(one["mu_c"])
+
+
+def test_the_residual_learns_what_the_mechanics_miss(data, known):
+    """A motion that depends on the configuration, which no number of the supports can make."""
+    true, outcome = known
+    moved = true.motion(data.pushes, outcome.pose)
+    moved[:, 2] += torch.where(data.pushes.whole_face, 0.0015, -0.001)
+    outcome = outcome._replace(pose=true.pose(data.pushes, moved))
+    model = run(Residual(**thing(data)), data.pushes, outcome)
+    with torch.no_grad():
+        after = (model.motion(data.pushes, model.predict(data.pushes).pose) - moved).norm(dim=-1).mean()
+        before = (model.motion(data.pushes, model.base.predict(data.pushes).pose) - moved).norm(dim=-1).mean()
+    assert after < 0.5 * before
+
+
+@pytest.mark.parametrize("kind", [Supports, Residual, Ridge, PushMLP])
+def test_a_model_from_its_state_predicts_the_same(data, known, kind):
+    _, outcome = known
+    model = run(kind(**thing(data)), data.pushes, outcome)
+    again = kind(**model.arguments)
+    again.load_state_dict(copy.deepcopy(model.state_dict()))
+    with torch.no_grad():
+        assert torch.equal(again.predict(data.pushes).pose, model.predict(data.pushes).pose)
+
+
+@pytest.mark.parametrize("kind", [Residual, Ridge])
+def test_a_prediction_does_not_depend_on_the_other_pushes(data, known, kind):
+    _, outcome = known
+    model = run(kind(**thing(data)), data.pushes, outcome)
+    with torch.no_grad():
+        together, alone = model.predict(data.pushes).pose, model.predict(data.pushes.take([7])).pose
+    torch.testing.assert_close(alone[0], together[7], atol=1e-10, rtol=0)
+
+
+def test_an_unknown_surface_is_refused_by_name(data, known):
+    model, _ = known
+    with pytest.raises(ValueError, match="surface: expected board or wood, as learned, got ice"):
+        model.predict(data.pushes._replace(surface=("ice",) * 24))
+
+
+def test_motion_and_pose_are_inverse(data, known):
+    model, outcome = known
+    there = model.pose(data.pushes, model.motion(data.pushes, outcome.pose))
+    torch.testing.assert_close(there[:, :2], outcome.pose[:, :2])
+    torch.testing.assert_close(there[:, 2].sin(), outcome.pose[:, 2].sin())
+
+
+def test_three_numbers_tell_where_real_pushes_end():
+    data = read_all_pushes(real_data("planar_pushes.npz"))
+    model = run(Supports(**thing(data)), data.pushes, data.outcome)
+    with torch.no_grad():
+        end = model.predict(data.pushes)
+    assert end.solved.all()
+    error = (model.motion(data.pushes, end.pose) - model.motion(data.pushes, data.outcome.pose)).norm(dim=-1)
+    assert 1e3 * error.mean() < 1.5
+    found = model.physical_parameters()
+    assert found["mu_hardboard"] == pytest.approx(0.300, abs=0.02)
+    assert found["mu_wood"] == pytest.approx(0.346, abs=0.02)
