@@ -64,6 +64,7 @@ def train(config: DictConfig) -> float:
             data,
             horizon=loss.pop("horizon"),
             loss=loss,
+            stages=settings["stages"],
             epochs=trainer.pop("max_epochs"),
             batch_size=config.batch_size,
             optimizer=hydra.utils.instantiate(config.optimizer, _convert_="all"),

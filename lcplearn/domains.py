@@ -5,12 +5,16 @@ from typing import Any, NamedTuple
 
 
 class Domain(NamedTuple):
-    """Numbers from low to high; finite, and without the ends where these are open."""
+    """Numbers from low to high; finite, and without the ends where these are open.
+
+    A number without bounds is learned in multiples of `unit`, so that one learning rate fits all numbers of a scene.
+    """
 
     low: float
     high: float
     open_low: bool
     words: str
+    unit: float = 1.0
 
     def __contains__(self, value: object) -> bool:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

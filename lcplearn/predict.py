@@ -10,6 +10,9 @@ lcplearn.datasets.Recordings.
 
 A model of pushes is judged by `--score PUSHES.npz`, a file like planar_pushes.npz; `--output` is then an NPZ file of
 predictions, `post_pose` (pushes, 3) [m, m, rad] and `force` (pushes, 2) [N].
+
+A model of tosses is judged by `--score TOSSES.npz`, a file like cube_tosses.npz; `--output` is then an NPZ file with
+the predicted `state` and `offsets`. They are predicted from row 0 of each toss and nothing else of it.
 """
 
 import argparse
@@ -159,8 +162,7 @@ def read_data(path: str | Path, model: Formulation) -> Task:
         FileNotFoundError: no such file.
         ValueError: not a file of recordings, or one with another time step than the model's.
     """
-    if not Path(path).exists() and str(Path(path).parent) in (".", "data"):
-        path = find(Path(path).name)  # where train.py looks
+    path = _found(path)
     slides = "offsets" in read_npz(path, (), optional=("offsets",))
     truth = tuple(model.physical_parameters())
     data = (
@@ -173,6 +175,12 @@ def read_data(path: str | Path, model: Formulation) -> Task:
     if model.needs_friction and data.test.drive.friction is None:
         raise ValueError(f"{type(model).__name__} needs measured friction, and {path} has no array 'friction'.")
     return data
+
+
+def _found(path: str | Path) -> Path:
+    """A data file, looked for where train.py looks if it isn't there."""
+    path = Path(path)
+    return find(path.name) if not path.exists() and str(path.parent) in (".", "data") else path
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -234,10 +242,23 @@ def _score(options: argparse.Namespace) -> None:
 
         print(score_pushes(model, options.score, options.output))
         return
+    if "state" in read_npz(_found(options.score), (), optional=("state",), finite=False):
+        _score_tosses(model, options)
+        return
     metrics = evaluate(model, read_data(options.score, model))
     print(format_table(metrics))
     if options.output:
         write_figures(options.output, metrics)
+
+
+def _score_tosses(model: Formulation, options: argparse.Namespace) -> None:
+    from lcplearn.training import toss_scores
+
+    tosses = toss_scores.read_for(_found(options.score), model)
+    predicted = toss_scores.predict_tosses(model, tosses)
+    print(toss_scores.report(model, predicted, tosses))
+    if options.output:
+        toss_scores.write_tosses(options.output, predicted, tosses)
 
 
 def _draw(inputs: Inputs, trajectory: Trajectory, model: Formulation) -> Any:

@@ -25,6 +25,10 @@ from lcplearn.datasets.contactnets import (
     TOSSES_FILE,
 )
 from lcplearn.datasets.files import check_offsets, find, positive_number, read_npz
+from lcplearn.datasets.recordings import Recordings
+from lcplearn.datasets.task import Task
+from lcplearn.scenes.scene import Drive
+from lcplearn.scenes.space import POSE
 
 # Numbers of the published files, drawn once: with seed 0 everybody learns from the same tosses and chooses by the same.
 LEARN = (
@@ -160,3 +164,49 @@ def split(numbers: tuple[int, ...], seed: int = 0) -> tuple[list[int], list[int]
         learn, choose = [where[n] for n in drawn[:first]], [where[n] for n in drawn[first:second]]
     taken = {*learn, *choose}
     return learn, choose, [index for index in range(len(numbers)) if index not in taken]
+
+
+def read_cube_tosses(path: Path | str | None = None, *, seed: int = 0, tosses: int = 64, judge: bool = True) -> Task:
+    """Real tosses of a cube: learn from some, choose by 48 others, judge by the rest.
+
+    Args:
+        path: The file; None for cube_tosses.npz where `find` looks.
+        seed: Seed of the split; 0 is the frozen one.
+        tosses: How many of the 64 to learn from, in their order.
+        judge: False judges by the 48 tosses that choose, too: whoever looks often should not look at the rest.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not what `lcplearn.datasets.contactnets` writes, or has too few tosses.
+    """
+    found = read_tosses(path)
+    learn, choose, rest = split(found.numbers, seed)
+    if not 1 <= tosses <= len(learn):
+        raise ValueError(f"tosses: expected 1 to {len(learn)}, got {tosses}")
+    return _task(found, learn[:tosses], choose, rest if judge else choose)
+
+
+def _task(found: Tosses, learn: list[int], choose: list[int], judge: list[int]) -> Task:
+    def recordings(chosen: list[int]) -> Recordings:
+        steps = found.steps[chosen]
+        states = found.states[chosen, : int(steps.max()) + 1]
+        return Recordings(states, Drive(states.new_zeros(len(chosen), states.shape[1] - 1, 6)), steps)
+
+    return Task(
+        name="cube tosses",
+        space=POSE,
+        dt=found.dt,
+        train=recordings(learn),
+        validation=recordings(choose),
+        test=recordings(judge),
+        given={
+            "half_width": found.half_width,
+            "mass": found.mass,
+            "gravity": found.gravity,
+            "inertia": found.inertia,
+            "mu": found.mu,
+            "restitution": found.restitution,
+        },
+        judged_by=("tosses",),
+        chosen_by="pose",
+    )

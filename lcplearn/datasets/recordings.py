@@ -59,6 +59,10 @@ class Windows(NamedTuple):
         """Apply a function, a choice of windows say, to all that is in them."""
         return Windows(f(self.states), self.drive.map(f), f(self.valid))
 
+    def first(self, k: int) -> "Windows":
+        """The first k steps of each window."""
+        return Windows(self.states[:, : k + 1], self.drive.map(lambda values: values[:, :k]), self.valid[:, :k])
+
 
 def windows(recordings: Recordings, k: int | None = None) -> Windows:
     """All stretches of k successive steps.

@@ -34,6 +34,8 @@ class Task:
         truth: True numbers, by name, that learned ones are compared with.
         judged_by: Names of judges (`lcplearn.training.metrics.JUDGES`).
         scene: What made the recordings; None if they are not simulated.
+        chosen_by: What the best model of a training is chosen by, on the validation recordings: "rollout", its velocity
+            error over windows, or "pose", its pose error over whole recordings.
 
     Raises:
         ValueError: A shape doesn't fit the space, recordings have no step, or dt is not positive.
@@ -50,6 +52,7 @@ class Task:
     truth: Mapping[str, float] = field(default_factory=dict)
     judged_by: tuple[str, ...] = MOTION
     scene: Scene | None = None
+    chosen_by: str = "rollout"
 
     def __post_init__(self) -> None:
         positive("dt", self.dt)

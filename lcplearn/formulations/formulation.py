@@ -69,6 +69,10 @@ class Formulation(nn.Module):
         """What a rollout advances: the model, or a scene with the learned numbers, made once for all steps."""
         return self
 
+    def moving_each(self, count: int) -> Scene:
+        """As `moving`, for rollouts of count windows whose gradients may need care one by one."""
+        return self.moving()
+
     def step(
         self,
         state: Float[Tensor, "*batch nq_plus_nv"],
@@ -98,7 +102,7 @@ class Formulation(nn.Module):
 
     def errors(self) -> dict[str, Callable[[Windows], Tensor]]:
         """Loss terms that the model has: functions of windows that give a value for each first step, or each step."""
-        return {"prediction": self.prediction_error, "rollout": self.rollout_error}
+        return {"prediction": self.prediction_error, "rollout": self.rollout_error, "pose": self.pose_error}
 
     def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
         """Squared error of the velocity after the first step of each window [m^2/s^2]."""
@@ -107,11 +111,25 @@ class Formulation(nn.Module):
 
     def rollout_error(self, windows: Windows) -> Float[Tensor, "B k"]:
         """Squared error of the velocity after each step, predicted from the window's first state [m^2/s^2]."""
-        scene, state, predicted = self.moving(), windows.states[:, 0], []
+        return self.velocity_error(self._predicted(windows), windows.states[:, 1:])
+
+    def pose_error(self, windows: Windows) -> Float[Tensor, "B k"]:
+        """Robust distance of the positions after each step, predicted from the window's first state [m].
+
+        c (sqrt(1 + d^2 / c^2) - 1), with rotations weighted by `radius` and c = radius / 10: nearly d where d > c, so
+        that windows that fell to another side don't decide alone.
+        """
+        predicted, measured = self._predicted(windows)[..., : self.space.nq], windows.states[:, 1:, : self.space.nq]
+        squared = self.space.squared_speed(self.space.difference(predicted, measured), self.radius)
+        c = self.radius / 10.0
+        return c * ((1.0 + squared / c**2).sqrt() - 1.0)
+
+    def _predicted(self, windows: Windows) -> Float[Tensor, "B k nq_plus_nv"]:
+        scene, state, predicted = self.moving_each(len(windows.valid)), windows.states[:, 0], []
         for k in range(windows.valid.shape[1]):
             state = scene.advance(state, windows.drive.at(k)).state
             predicted.append(state)
-        return self.velocity_error(torch.stack(predicted, dim=-2), windows.states[:, 1:])
+        return torch.stack(predicted, dim=-2)
 
     def velocity_error(
         self, predicted: Float[Tensor, "*batch nq_plus_nv"], measured: Float[Tensor, "*batch nq_plus_nv"]

@@ -29,6 +29,9 @@ class Identified(Formulation):
         dt: Time step [s].
         given: Known values by name, lists for tensors; those that the scene has no use for are left aside.
         learn: Start of each learned number, or list of numbers, by name.
+        clip: Times the median norm of the windows' gradients at which each is clipped; None leaves them alone. A
+            window whose body is about to land on another corner has a thousand times the gradient of others. 10 is
+            right for tosses; 2 biases friction.
 
     Raises:
         ValueError: scene can't be imported or has no numbers, learn names none of them or starts outside its domain,
@@ -42,6 +45,7 @@ class Identified(Formulation):
         dt: float,
         learn: Mapping[str, Number],
         given: Mapping[str, Any] | None = None,
+        clip: float | None = None,
     ) -> None:
         kind = _class(scene)
         fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
@@ -67,8 +71,8 @@ class Identified(Formulation):
         start = kind(dt=dt, **fixed, **{name: _tensor(value) for name, value in learn.items()})
         super().__init__(space=start.space, dt=dt, given=fixed)
         self.fixed = fixed
-        self.contacts, self.radius = start.contacts, getattr(start, "radius", 1.0)
-        self.scene_type, self.domains = kind, learned
+        self.contacts, self.radius = start.contacts, getattr(start, "length", 1.0)
+        self.scene_type, self.domains, self.clip = kind, learned, clip
         self.free = nn.ParameterDict(starts)
 
     def numbers(self) -> dict[str, Tensor]:
@@ -82,6 +86,21 @@ class Identified(Formulation):
         scene: Scene = self.scene_type(dt=self.dt, **numbers)
         return scene
 
+    def moving_each(self, count: int) -> Scene:
+        """As `moving`; to clip gradients one by one each of count windows has numbers of its own."""
+        if self.clip is None:
+            return self.moving()
+        free = torch.cat([self.free[name].reshape(-1) for name in self.domains]).expand(count, -1)
+        if free.requires_grad:
+            free.register_hook(lambda gradients: clip_rows(gradients, self.clip))
+        parts = free.split([self.free[name].numel() for name in self.domains], dim=-1)
+        numbers = {
+            name: _bound(part.reshape(count, *self.free[name].shape), domain)
+            for (name, domain), part in zip(self.domains.items(), parts, strict=True)
+        }
+        scene: Scene = self.scene_type(dt=self.dt, **{**self.fixed, **numbers})
+        return scene
+
     def advance(self, state: Float[Tensor, "*batch nq_plus_nv"], drive: Drive) -> Step:
         return self.moving().advance(state, drive)
 
@@ -90,10 +109,11 @@ class Identified(Formulation):
         more = {"violation": self._violation_error} if hasattr(self.scene_type, "violation") else {}
         return super().errors() | more
 
-    def _violation_error(self, windows: Windows) -> Float[Tensor, " B"]:
-        scene: Any = self.moving()
-        found: Tensor = scene.violation(windows.states[:, 0], windows.drive.at(0), windows.states[:, 1])
-        return found
+    def _violation_error(self, windows: Windows) -> Float[Tensor, "B k"]:
+        scene: Any = self.moving_each(windows.valid.numel())
+        before, after = windows.states[:, :-1].flatten(0, 1), windows.states[:, 1:].flatten(0, 1)
+        found: Tensor = scene.violation(before, windows.drive.map(lambda values: values.flatten(0, 1)), after)
+        return found.reshape(windows.valid.shape)
 
     def physical_parameters(self) -> dict[str, float]:
         values: dict[str, float] = {}
@@ -159,9 +179,19 @@ def _free(name: str, value: Number, domain: Domain) -> nn.Parameter:
     inside = all(number in domain and number not in (domain.low, domain.high) for number in start.reshape(-1).tolist())
     if not inside:
         raise ValueError(f"{name}: expected {domain.words}, inside its bounds, got {value}")
-    if domain is REAL:
-        return nn.Parameter(start.clone())
+    if domain.low == REAL.low:
+        return nn.Parameter(start / domain.unit)
     return nn.Parameter(start.logit() if domain is SHARE else start.log())
+
+
+def clip_rows(gradients: Float[Tensor, "N P"], most: float) -> Float[Tensor, "N P"]:
+    """Clip each row at most times the median norm of those that are not 0; a row that is not finite becomes 0."""
+    norms = gradients.norm(dim=-1)
+    fine = norms.isfinite() & (norms > 0.0)
+    if not bool(fine.any()):
+        return torch.zeros_like(gradients)
+    factor = (most * norms[fine].median() / norms).clamp(max=1.0)
+    return torch.where(fine.unsqueeze(-1), gradients * factor.unsqueeze(-1), 0.0)
 
 
 def _tensor(value: Any) -> Tensor:
@@ -169,6 +199,6 @@ def _tensor(value: Any) -> Tensor:
 
 
 def _bound(free: Tensor, domain: Domain) -> Tensor:
-    if domain is REAL:
-        return free
+    if domain.low == REAL.low:
+        return free * domain.unit
     return free.sigmoid() if domain is SHARE else free.exp()

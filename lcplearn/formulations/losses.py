@@ -19,6 +19,7 @@ def loss_terms(model: Formulation, windows: Windows, weights: Mapping[str, float
 
     prediction:       squared error of one step: of (v+, v-) where the model decomposes velocity, else of v
     rollout:          squared error of v over all steps of the window, predicted from its first measured state
+    pose:             robust distance of positions over all steps of the window [m], see `Formulation.pose_error`
     complementarity:  (friction * (v+, v-))^2, `direct` and `slack` only
     nonnegativity:    max(0, -(v+, v-))^2, `direct` and `slack` only
     violation:        how badly the best friction explains a measured step, `structured` and scenes that say so

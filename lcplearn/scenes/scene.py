@@ -81,7 +81,7 @@ class Scene(Protocol):
     A scene may have more, which is used where it is there: `numbers`, a mapping from the names of its constructor's
     numbers to their `Domain` (`Identified` learns them); `violation(state, drive, after)`, how badly the best contact
     force explains a measured step [m^2/s^2], [*batch] (a loss); a constructor argument `temperature`, which softens
-    its thresholds in training; `radius` [m], which weighs rotations against translations.
+    its thresholds in training; `length` [m], which weighs rotations against translations.
 
     Attributes:
         space: What a state is.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
 from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, compiled_contacts, contact_step, rebound
+from lcplearn.scenes.contact_violation import Touch
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Step, Trajectory, rollout
 from lcplearn.scenes.space import POSE, Space, rotation_matrix
@@ -151,6 +152,12 @@ class SpatialBody:
         )
         states, mode, solved = (x.reshape((*batch, *x.shape[1:])) for x in (states, mode, solved))
         return Trajectory(*POSE.split(states), mode, solved)
+
+    def touch_at(self, position: Float[Tensor, "*#batch 7"]) -> Touch:
+        """Gaps, Jacobians and friction coefficients of the corners at a pose, as at rest there."""
+        still = torch.zeros_like(position[..., :6])
+        contacts = self._contacts(position, still, still, rotation_matrix(position[..., 3:]))
+        return Touch(contacts.gap, contacts.normal, contacts.tangents, contacts.mu.expand(contacts.gap.shape))
 
     def _mass(self, like: Tensor) -> Tensor:
         """Diagonal of the mass matrix [*batch, 6]."""

@@ -27,7 +27,7 @@ def hyperparameters(module: FormulationModule, used: Mapping[str, Any], epochs: 
         "4 lr": used["optimizer"]["lr"],
         "5 epochs": epochs,
         "batch_size": used["batch_size"] or "all",
-        "horizon": module.horizon,
+        "horizon": module.stages[-1].horizon,
         "loss": " ".join(f"{name}={weight:g}" for name, weight in weights.items()),
         "model arguments": " ".join(f"{name}={value}" for name, value in arguments.items()),
     }

@@ -17,7 +17,7 @@ from lcplearn.datasets import Task
 from lcplearn.training.checkpoint import read
 from lcplearn.training.figures_of_merit import KEYS
 from lcplearn.training.metrics import one_step
-from lcplearn.training.module import VALIDATION, FormulationModule
+from lcplearn.training.module import FormulationModule
 from lcplearn.training.writing import copy, write_figures
 
 TAGS = {
@@ -49,7 +49,7 @@ class Report(pl.Callback):
         model = pl_module.model
         found = one_step(model, self.validation)
         scalars = {tag: value for name, tag in TAGS.items() if (value := found[name]) is not None}
-        scalars |= {tag: float(trainer.callback_metrics[tag]) for tag in (VALIDATION, "val/loss")}
+        scalars |= {tag: float(trainer.callback_metrics[tag]) for tag in (pl_module.monitor, "val/loss")}
         for name, value in model.physical_parameters().items():
             scalars[f"parameters/{name}"] = value
             if name in self.data.truth:
@@ -86,8 +86,8 @@ class Divergence(pl.Callback):
         terms = [name for name, value in (outputs or {}).items() if not math.isfinite(float(value))]
         self._end(trainer, pl_module, f"the loss term '{terms[0]}'" if terms else None)
 
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        error = float(trainer.callback_metrics.get(VALIDATION, 0.0))
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
+        error = float(trainer.callback_metrics.get(pl_module.monitor, 0.0))
         self._end(trainer, pl_module, None if math.isfinite(error) else "the error on the validation data")
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -121,13 +121,12 @@ class BestCheckpoint(ModelCheckpoint):
 
     Args:
         folder: Of the run.
+        monitor: The figure that it is best by.
         resumed: The checkpoint that is resumed, beside which the best model so far lies.
     """
 
-    def __init__(self, folder: Path, resumed: str | Path | None = None) -> None:
-        super().__init__(
-            folder, "best", monitor=VALIDATION, enable_version_counter=False, save_on_train_epoch_end=False
-        )
+    def __init__(self, folder: Path, monitor: str, resumed: str | Path | None = None) -> None:
+        super().__init__(folder, "best", monitor=monitor, enable_version_counter=False, save_on_train_epoch_end=False)
         self.resumed = resumed
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -162,8 +161,8 @@ class EpochBar(ProgressBar):
             self.bar.update()
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
-        if self.bar is not None and VALIDATION in trainer.callback_metrics:
-            values = {VALIDATION: float(trainer.callback_metrics[VALIDATION])} | pl_module.model.physical_parameters()
+        if self.bar is not None and (monitor := pl_module.monitor) in trainer.callback_metrics:
+            values = {monitor: float(trainer.callback_metrics[monitor])} | pl_module.model.physical_parameters()
             self.bar.set_postfix({name: f"{value:.3g}" for name, value in values.items()}, refresh=False)
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:

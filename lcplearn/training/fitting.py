@@ -4,7 +4,7 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -32,9 +32,10 @@ from lcplearn.training.callbacks import (
     TrainingDivergedError,
 )
 from lcplearn.training.checkpoint import check_resumable, read
-from lcplearn.training.module import VALIDATION, FormulationModule
+from lcplearn.training.module import FormulationModule
 from lcplearn.training.optimizer import Optimizer
 from lcplearn.training.results import leave
+from lcplearn.training.stages import plan
 from lcplearn.training.writing import AtomicCheckpointIO
 
 DEFAULTS = {"precision": "64-true", "accelerator": "cpu", "devices": 1, "enable_model_summary": False}
@@ -71,6 +72,7 @@ def fit(
     *,
     loss: Mapping[str, float] | None = None,
     horizon: int = 1,
+    stages: Sequence[Mapping[str, Any]] = (),
     epochs: int = 200,
     batch_size: int | None = None,
     optimizer: Optimizer | None = None,
@@ -90,7 +92,8 @@ def fit(
         data: Recordings to learn from.
         loss: Weights of the loss terms; {"prediction": 1.0} by default.
         horizon: Steps of a training window; only the rollout loss uses more than one.
-        epochs: Epochs to train at most.
+        stages: What comes before, each with its epochs and what differs: lr, a shorter horizon, weights of loss terms.
+        epochs: Epochs to train at most, those of stages included.
         batch_size: Windows in a batch; None for the full batch, which is best for these small models.
         optimizer: Adam alone by default.
         patience: Validations without improvement after which to stop; None to go on.
@@ -117,8 +120,11 @@ def fit(
         raise ValueError(f"epochs: expected at least 1, got {epochs}")
     folder = _new_folder(folder)
     _quiet()
-    batches, validation = windows(data.train, horizon), windows(data.validation, horizon)
-    _try_once(model, batches.map(lambda values: values[:1]), loss)
+    planned = plan(stages, loss=loss, horizon=horizon, epochs=epochs, lr=optimizer.lr)
+    batches = windows(data.train, horizon)
+    validation = windows(data.validation, horizon if data.chosen_by == "rollout" else None)
+    for stage in planned:
+        _try_once(model, batches.map(lambda values: values[:1]).first(stage.horizon), stage.loss)
     loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
     chosen = {"max_epochs": epochs, "check_val_every_n_epoch": 10, **DEFAULTS, **(trainer or {})}
     every = chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
@@ -126,18 +132,19 @@ def fit(
         "seed": seed,
         "batch_size": batch_size,
         "optimizer": asdict(optimizer),
+        "stages": [dict(stage) for stage in stages],
         "data": described_data(data, settings),
     }
     module = FormulationModule(
-        model, loss=loss, horizon=horizon, optimizer=optimizer, training=flat(used),
+        model, stages=planned, optimizer=optimizer, chosen_by=data.chosen_by, training=flat(used),
         log_every=every * (len(loader) if batch_size else 1),
     )  # fmt: skip
-    best, last = BestCheckpoint(folder, ckpt_path), LastCheckpoint(folder / "last.ckpt", every)
+    best, last = BestCheckpoint(folder, module.monitor, ckpt_path), LastCheckpoint(folder / "last.ckpt", every)
     callbacks = [Divergence(folder), best, last, Report(data), *chosen.pop("callbacks", [])]
     if chosen.get("enable_progress_bar", True):
         callbacks.append(EpochBar())
     if patience is not None:
-        callbacks.append(EarlyStop(VALIDATION, patience=patience))
+        callbacks.append(EarlyStop(module.monitor, patience=patience))
     if chosen["precision"] not in ("64-true", "64", 64):
         raise ValueError(
             f"trainer: expected precision 64-true, as sticking is judged at 1e-12 m/s, got {chosen['precision']}"

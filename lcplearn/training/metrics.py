@@ -14,6 +14,7 @@ from lcplearn.datasets import Recordings, Task
 from lcplearn.formulations import Formulation
 from lcplearn.scenes.scene import STICK_SPEED, Step, Trajectory
 from lcplearn.training.figures_of_merit import KEYS, figure, in_order
+from lcplearn.training.toss_metrics import score_tosses, summarise
 
 Figures = dict[str, float | None]
 
@@ -101,10 +102,33 @@ def judge_stops(found: Predictions) -> Figures:
     }
 
 
+def judge_tosses(found: Predictions) -> Figures:
+    """How far whole tosses of a cube are from the recorded ones; see `toss_metrics`."""
+    test, path = found.task.test, found.test
+    scores = score_tosses(
+        test.states, torch.cat((path.positions, path.velocities), dim=-1), test.steps, found.task.given["half_width"]
+    )
+    position, rotation = (
+        summarise(scores[name]) for name in ("position integral [% width]", "rotation integral [deg]")
+    )
+    unsolved = None if path.solved is None else _share(~path.solved[test.valid])
+    return {
+        "position_integral": position.mean,
+        "position_integral_median": position.median,
+        "rotation_integral": rotation.mean,
+        "rotation_integral_median": rotation.median,
+        "penetration_beyond": float(scores["penetration integral beyond the recorded [% width]"].mean()),
+        "same_face": float(scores["same face down at the end [share]"].mean()),
+        "at_rest": float(scores["at rest at the end [share]"].mean()),
+        "unsolved_share": unsolved,
+    }
+
+
 JUDGES: dict[str, Callable[[Predictions], Figures]] = {
     "one_step": judge_one_step,
     "rollout": judge_rollout,
     "stops": judge_stops,
+    "tosses": judge_tosses,
 }
 
 

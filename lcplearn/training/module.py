@@ -1,7 +1,7 @@
 """The LightningModule: one formulation, its loss and its optimisers."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import lightning.pytorch as pl
@@ -12,11 +12,15 @@ from lcplearn.datasets import Windows
 from lcplearn.formulations import Formulation, loss_terms
 from lcplearn.training.checkpoint import describe
 from lcplearn.training.optimizer import Optimizer
+from lcplearn.training.stages import Stage
 
 # torch's LBFGS learns curvature only from steps with y.s > 1e-10, an absolute number: losses of 1e-12 need enlarging.
 LBFGS_SCALE = 1e8
 
-VALIDATION = "val/rollout_rmse"  # [m/s], velocity error over the steps of a window, against measured velocities
+VALIDATION = {  # what the best model is chosen by, against measured states: `Task.chosen_by`, and its name in logs
+    "rollout": "val/rollout_rmse",  # [m/s], velocity error over the steps of a window
+    "pose": "val/pose_error",  # [m], robust, over whole recordings
+}
 
 
 class FormulationModule(pl.LightningModule):
@@ -27,8 +31,8 @@ class FormulationModule(pl.LightningModule):
 
     Args:
         model: What to train.
-        loss: Weights of the loss terms.
-        horizon: Steps of a training window.
+        stages: What is minimised when.
+        chosen_by: What the best model is chosen by, see `VALIDATION`.
         optimizer: Optimisers and their schedule.
         log_every: Steps between two logs of the loss.
         training: What else the training was asked for, as plain values; a resumption compares it.
@@ -42,15 +46,16 @@ class FormulationModule(pl.LightningModule):
         self,
         model: Formulation,
         *,
-        loss: Mapping[str, float],
-        horizon: int,
+        stages: Sequence[Stage],
         optimizer: Optimizer,
+        chosen_by: str = "rollout",
         log_every: int = 1,
         training: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.model, self.loss, self.optimizer, self.horizon = model, dict(loss), optimizer, horizon
+        self.model, self.stages, self.optimizer, self.chosen_by = model, tuple(stages), optimizer, chosen_by
+        self.monitor = VALIDATION[chosen_by]
         self.log_every, self.training_settings = log_every, dict(training or {})
         self.seconds_before, self.started = 0.0, time.perf_counter()
 
@@ -61,9 +66,11 @@ class FormulationModule(pl.LightningModule):
         self.started = time.perf_counter()
 
     def on_train_epoch_start(self) -> None:
-        adam = self._optimizers()[0]
+        adam, stage = self._optimizers()[0], self.stage
+        if self.current_epoch == stage.first:
+            adam.state.clear()  # the gradients of another loss have another size
         for group in adam.param_groups:
-            group["lr"] = self.optimizer.learning_rate(self.current_epoch, self.trainer.max_epochs or 1)
+            group["lr"] = stage.learning_rate(self.current_epoch, self.optimizer)
 
     def training_step(self, windows: Windows, index: int) -> dict[str, Tensor]:
         finishes = self.optimizer.finishes(self.current_epoch)
@@ -91,8 +98,10 @@ class FormulationModule(pl.LightningModule):
     def validation_step(self, windows: Windows, index: int) -> None:
         # The best model is the one that predicts best as it is deployed. The loss may say otherwise: that of `direct`
         # has a floor which differs between training and validation data although the velocity is exact.
-        terms = loss_terms(self.model, windows, {"rollout": 1.0} | {k: v for k, v in self.loss.items() if v})
-        values = {VALIDATION: terms["rollout"].sqrt(), "val/loss": self._total(terms)}
+        loss = self.stage.loss
+        terms = loss_terms(self.model, windows, {self.chosen_by: 1.0} | {k: v for k, v in loss.items() if v})
+        chosen = terms[self.chosen_by].sqrt() if self.chosen_by == "rollout" else terms[self.chosen_by]
+        values = {self.monitor: chosen, "val/loss": self._total(terms)}
         self.log_dict(values, sync_dist=True, batch_size=len(windows.valid), logger=False)  # callbacks.Report does
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -104,9 +113,14 @@ class FormulationModule(pl.LightningModule):
     @property
     def described(self) -> dict[str, Any]:
         """What is trained, what is minimised, and by what, as plain values."""
-        loss = {name: weight for name, weight in self.loss.items() if weight}
-        objective = {"loss": loss, "horizon": self.horizon}
+        last = self.stages[-1]
+        objective = {"loss": {name: weight for name, weight in last.loss.items() if weight}, "horizon": last.horizon}
         return {"formulation": describe(self.model), "objective": objective, "training": self.training_settings}
+
+    @property
+    def stage(self) -> Stage:
+        """That of the current epoch."""
+        return [stage for stage in self.stages if stage.first <= self.current_epoch][-1]
 
     @property
     def seconds(self) -> float:
@@ -115,10 +129,11 @@ class FormulationModule(pl.LightningModule):
 
     def _terms(self, windows: Windows) -> dict[str, Tensor]:
         with self.model.softened(self.optimizer.temperature(self.current_epoch)):
-            return loss_terms(self.model, windows, self.loss)
+            return loss_terms(self.model, windows.first(self.stage.horizon), self.stage.loss)
 
     def _total(self, terms: Mapping[str, Tensor]) -> Tensor:
-        return torch.stack([self.loss[name] * term for name, term in terms.items() if self.loss.get(name)]).sum()
+        loss = self.stage.loss
+        return torch.stack([loss[name] * term for name, term in terms.items() if loss.get(name)]).sum()
 
     def _optimizers(self) -> list[Any]:
         found = self.optimizers()

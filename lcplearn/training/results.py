@@ -17,6 +17,7 @@ from lcplearn.training.writing import write_figures
 # The figures that stand beside the hyperparameters; metrics.json and the table have all.
 MAIN = (
     "velocity_rmse", "stick_accuracy", "rollout_rmse_1000", "stop_error_median_mm", "rest_share", "mu_error",
+    "position_integral", "rotation_integral", "at_rest",
     "train_seconds",
 )  # fmt: skip
 

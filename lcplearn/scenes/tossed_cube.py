@@ -1,0 +1,137 @@
+"""A cube tossed onto level ground, in the numbers that tosses can teach."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
+from lcplearn.scenes.contact import RestitutionLaw
+from lcplearn.scenes.contact_violation import contact_violation
+from lcplearn.scenes.numbers import Number
+from lcplearn.scenes.scene import Drive, Step, Trajectory
+from lcplearn.scenes.space import POSE, Space
+from lcplearn.scenes.spatial_body import SpatialBody, box_corners
+
+IMPACT_SPEED = 10.0  # [half widths/s] closing speed from which on an impact has the friction mu_impact
+TENTH = 0.00524  # [m] a tenth of the published cube's half width: lengths that may be negative are learned in this unit
+
+
+@dataclass(frozen=True)
+class TossedCube:
+    """`SpatialBody` with the corners of a cube, rounded, or with corners of its own.
+
+    Attributes:
+        half_width: Half of the cube's width [m].
+        inertia: Moment of inertia about every axis [kg m^2].
+        mu, mu_impact, restitution, mass, gravity, compliance, restitution_law: As in `SpatialBody`.
+        radius: Of the spheres at the corners [m]. They are moved in by as much, so that the faces stay where they are.
+        ground: Height of the ground [m].
+        corners: Centres of the spheres in body coordinates [m], in place of the cube's; [8, 3] or [*batch, 8, 3].
+        polygon: As in `SpatialBody`.
+    """
+
+    half_width: float
+    inertia: Number
+    mu: Number
+    dt: float
+    mass: float = 1.0
+    mu_impact: Number | None = None
+    restitution: Number = 0.0
+    radius: Number = 0.0
+    ground: Number = 0.0
+    gravity: float = 9.81
+    compliance: Number = 1e-3
+    restitution_law: RestitutionLaw = "continuous"
+    corners: Tensor | None = None
+    polygon: int | None = None
+
+    numbers: ClassVar[Mapping[str, Domain]] = {
+        "mu": POSITIVE,
+        "mu_impact": POSITIVE,
+        "restitution": SHARE,
+        "inertia": POSITIVE,
+        "radius": POSITIVE,
+        "compliance": POSITIVE,
+        "ground": REAL._replace(unit=TENTH),
+        "corners": REAL._replace(unit=2.0 * TENTH),
+    }
+
+    def __post_init__(self) -> None:
+        check(POSITIVE, half_width=self.half_width)
+        check(NOT_NEGATIVE, radius=self.radius)
+
+    @property
+    def space(self) -> Space:
+        """`POSE`."""
+        return POSE
+
+    @property
+    def contacts(self) -> int:
+        """Eight."""
+        return 8
+
+    @property
+    def length(self) -> float:
+        """What weighs rotations against translations [m]."""
+        return self.half_width
+
+    @property
+    def body(self) -> SpatialBody:
+        """The body that moves."""
+        corners = self.corners
+        if corners is None:
+            radius = self.radius
+            like = radius if isinstance(radius, Tensor) else torch.zeros((), dtype=torch.float64)
+            corners = box_corners(torch.full((3,), self.half_width, dtype=like.dtype, device=like.device), radius)
+        return SpatialBody(
+            corners=corners,
+            inertia=self.inertia,
+            mu=self.mu,
+            dt=self.dt,
+            mass=self.mass,
+            radius=self.radius,
+            restitution=self.restitution,
+            mu_impact=self.mu_impact,
+            impact_speed=IMPACT_SPEED * self.half_width,
+            ground=self.ground,
+            gravity=self.gravity,
+            compliance=self.compliance,
+            restitution_law=self.restitution_law,
+            polygon=self.polygon,
+        )
+
+    def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
+        """Advance a state by one step; the mode is that of each corner."""
+        return self.body.advance(state, drive)
+
+    def rollout(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Trajectory:
+        """As `SpatialBody.rollout`."""
+        return self.body.rollout(state, drive)
+
+    def violation(
+        self, before: Float[Tensor, "*batch 13"], drive: Drive, after: Float[Tensor, "*batch 13"]
+    ) -> Float[Tensor, "*batch"]:
+        """How badly the best contact impulses explain a recorded step [m^2/s^2]; see `contact_violation`.
+
+        Restitution and friction at impacts have no part in it.
+        """
+        position, velocity = POSE.split(after)
+        contacts = self.body.touch_at(position)
+        linear = before.new_tensor([0.0, 0.0, -self.gravity]) + drive.force[..., :3] / self.mass
+        acceleration = torch.cat((linear, torch.zeros_like(linear)), dim=-1)  # a torque is not driven
+        one = torch.ones_like(velocity[..., :1])
+        inertia = torch.as_tensor(self.inertia, dtype=velocity.dtype) / self.mass
+        return contact_violation(
+            contacts,
+            velocity,
+            velocity - before[..., 7:] - self.dt * acceleration,
+            torch.cat(
+                (one.expand(*one.shape[:-1], 3), (inertia.unsqueeze(-1) * one).expand(*one.shape[:-1], 3)), dim=-1
+            ),
+            velocity.new_tensor([1.0] * 3 + [self.half_width**2] * 3),
+            self.dt,
+        )

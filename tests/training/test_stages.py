@@ -1,0 +1,34 @@
+"""Stages of a training."""
+
+import pytest
+
+from lcplearn.training.optimizer import Optimizer
+from lcplearn.training.stages import plan
+
+LAST = {"loss": {"pose": 1.0}, "horizon": 32, "epochs": 10, "lr": 0.03}
+
+
+def test_a_stage_says_what_differs_and_the_last_gets_the_rest():
+    first, second, last = plan(
+        [{"epochs": 3, "horizon": 8, "violation": 1.0, "pose": 0.0}, {"epochs": 2, "lr": 0.1}], **LAST
+    )
+    assert (first.first, first.epochs, first.horizon, first.lr) == (0, 3, 8, 0.03)
+    assert first.loss == {"pose": 0.0, "violation": 1.0}
+    assert (second.first, second.horizon, second.lr, second.loss) == (3, 32, 0.1, {"pose": 1.0})
+    assert (last.first, last.epochs, last.lr) == (5, 5, 0.03)
+
+
+def test_the_rate_starts_anew_and_decays_within_a_stage():
+    stage = plan([{"epochs": 4, "lr": 0.1}], **LAST)[0]
+    rates = [stage.learning_rate(epoch, Optimizer()) for epoch in range(4)]
+    assert rates[0] == pytest.approx(0.1)
+    assert rates == sorted(rates, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("before", "message"),
+    [([{"epochs": 10}], "stage 2"), ([{"horizon": 8}], "stage 1"), ([{"epochs": 1, "horizon": 64}], "from 1 to 32")],
+)
+def test_stages_that_make_no_sense(before: list[dict[str, int]], message: str):
+    with pytest.raises(ValueError, match=message):
+        plan(before, **LAST)
