@@ -15,7 +15,7 @@ from lcplearn.formulations.formulation import Formulation
 from lcplearn.scenes.scene import Drive, Scene, Step
 from lcplearn.scenes.sliding_block import SlidingBlock
 
-Number = float | Sequence[float]
+Number = float | Sequence[float] | Sequence[Sequence[float]]
 
 
 class Identified(Formulation):

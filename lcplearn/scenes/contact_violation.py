@@ -82,6 +82,7 @@ def contact_violation(
     beyond_cone = impulse[..., 1:].sum(-1) - touch.mu * impulse[..., 0]
     value = (
         0.5 * residual.square().sum(-1)
+        + 0.5 * SOFTENING * impulse.square().sum((-2, -1))
         + (impulse * cost).sum((-2, -1))
         + (multiplier * beyond_cone).sum(-1)
         + WEIGHT * (torch.relu(-touch.gap) / dt).square().sum(-1)

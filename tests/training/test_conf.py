@@ -4,16 +4,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from training.helpers import ROOT
 
-from lcplearn.datasets import Task, simulate_sliding_block
+from lcplearn.datasets import Recordings, Task, simulate_sliding_block
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.formulations import FORMULATIONS, Formulation, build
 from lcplearn.formulations.pushing import PushModel
+from lcplearn.scenes.scene import Drive
+from lcplearn.scenes.space import POSE
 from lcplearn.training import settings as checks
 from lcplearn.training.optimizer import Optimizer
 
@@ -42,20 +45,26 @@ EVERY = [choice for choice in EVERY if choice not in PUSHES]
 
 
 @pytest.fixture(scope="module")
-def tasks() -> dict[bool, Task]:
-    """One of the spring, and one of a sliding block for everything else."""
+def tasks() -> dict[str, Task]:
+    """One of the spring, one of a tossed cube, and one of a sliding block for everything else."""
+    state = torch.zeros(1, 2, 13, dtype=torch.float64)
+    one = Recordings(state, Drive(torch.zeros(1, 1, 6, dtype=torch.float64)), torch.tensor([1]))
+    given = {"half_width": 0.05, "mass": 0.4, "gravity": 9.81, "inertia": 8e-4, "mu": 0.2, "restitution": 0.1}
     return {
-        False: simulate_sliding_block(trajectories=1, long_length=1),
-        True: simulate_spring_block(trajectories=1, long_length=1),
+        "block": simulate_sliding_block(trajectories=1, long_length=1),
+        "spring": simulate_spring_block(trajectories=1, long_length=1),
+        "cube": Task(name="tosses", space=POSE, dt=0.01, train=one, validation=one, test=one, given=given),
     }
 
 
 @pytest.mark.parametrize("choice", EVERY)
-def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, tasks: dict[bool, Task]) -> None:
+def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, tasks: dict[str, Task]) -> None:
     chosen = settings(*choice.split())
     checks.check(chosen, CONF)
     asked = instantiate(chosen["model"], _partial_=True, _convert_="all")
-    assert isinstance(build(asked.func, tasks["data=spring" in choice], **asked.keywords), Formulation)
+    cubes = ("model=cube", "experiment=cube_body", "experiment=cube_corners")
+    kind = "spring" if "data=spring" in choice else "cube" if choice.startswith(cubes) else "block"
+    assert isinstance(build(asked.func, tasks[kind], **asked.keywords), Formulation)
     assert isinstance(instantiate(chosen["optimizer"], _convert_="all"), Optimizer)
 
 
@@ -70,7 +79,7 @@ def test_every_model_of_pushes_passes_the_check_and_is_built(choice: str) -> Non
 def test_every_formulation_has_a_configuration() -> None:
     others = [name for name in names("model") if not name.startswith("push_")]
     targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in others}
-    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified"}
+    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified", "CubeCorners"}
 
 
 def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
