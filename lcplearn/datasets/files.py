@@ -18,7 +18,8 @@ def find(name: str) -> Path:
     path = Path(os.environ.get("LCPLEARN_DATA") or "data") / name
     if not path.is_file():
         raise FileNotFoundError(
-            f"{path}: no such file; data/README.md has the command that makes it, and LCPLEARN_DATA can name its folder"
+            f"{path}: no such file; `python -m lcplearn.datasets.get slides|tosses|pushes` brings published recordings "
+            "(see data/README.md), and LCPLEARN_DATA can name their folder"
         )
     return path
 
