@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from lcplearn.lcp.solve import solve_lcp
     from lcplearn.training.checkpoint import load
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["LCPError", "LCPLayer", "LCPSolution", "Status", "load", "solve_lcp"]
 
 _HOMES = {

@@ -33,8 +33,8 @@ def solve_lcp(
     P-matrix, a solution that exists is found. Any other M gets a true status.
 
     Args:
-        M, q: float32 or float64, of one dtype and device; batch dimensions broadcast, n may be 0. The arithmetic is
-            float64 throughout; results come back in the caller's dtype.
+        M: float32 or float64 matrices. The arithmetic is float64 throughout; results come back in the caller's dtype.
+        q: Vectors of the dtype and device of M; batch dimensions broadcast, n may be 0.
         method: "diagonal" is the closed form z = max(0, -q / diag M) for M that the caller knows to be diagonal (one
             that is not is solved by pivoting on the CPU, and never wrongly SOLVED elsewhere);
             "pivoting" is the CPU kernel (the first call ever compiles it: half a minute); "interior_point" runs on

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if "```python" in page.read_text()]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [page for page in (ROOT / "README.md", *DOCS) if "```python" in page.read_text()]
 NOT_RUN = "# not run:"  # the first line of a block that needs what a test has not, with the reason
 
 

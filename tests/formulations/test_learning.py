@@ -1,4 +1,4 @@
-"""What formulations learn from simulated data in a second each: the figures of README's table, on one seed."""
+"""What formulations learn from simulated data in a second each: the figures of docs/formulations.md, on one seed."""
 
 from collections.abc import Mapping
 
