@@ -1,7 +1,9 @@
 """Which numbers an argument may be: checked in one place, and read where numbers are learned."""
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from numbers import Real
+from typing import Any, NamedTuple, Protocol
 
 
 class Domain(NamedTuple):
@@ -17,9 +19,10 @@ class Domain(NamedTuple):
     unit: float = 1.0
 
     def __contains__(self, value: object) -> bool:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
             return False
-        return self.low <= value <= self.high and not (self.open_low and value == self.low)
+        number = float(value)
+        return self.low <= number <= self.high and not (self.open_low and number == self.low)
 
 
 REAL = Domain(-math.inf, math.inf, False, "a finite number")
@@ -29,7 +32,7 @@ SHARE = Domain(0.0, 1.0, False, "a number from 0 to 1")
 
 
 def check(domain: Domain, **values: Any) -> None:
-    """Check numbers by name; what is not a Python number (a tensor, say) is left to whoever made it.
+    """Check numbers by name; what is no plain number (a tensor, say) is left to whoever made it.
 
     Looking into a tensor would wait for its device.
 
@@ -37,8 +40,31 @@ def check(domain: Domain, **values: Any) -> None:
         ValueError: A number is outside the domain.
     """
     for name, value in values.items():
-        if isinstance(value, int | float) and value not in domain:
+        if isinstance(value, Real) and value not in domain:
             raise ValueError(f"{name}: expected {domain.words}, got {value}")
+
+
+class Numbered(Protocol):
+    """A scene that says which of its arguments are numbers, and of which domain."""
+
+    @property
+    def numbers(self) -> Mapping[str, Domain]: ...
+
+    @property
+    def dt(self) -> float: ...
+
+
+def check_numbers(scene: Numbered) -> None:
+    """Check dt and all `numbers` of a scene, in tuples too.
+
+    Raises:
+        ValueError: One is outside its domain; the message names it.
+    """
+    check(POSITIVE, dt=scene.dt)
+    for name, domain in scene.numbers.items():
+        value = getattr(scene, name)
+        for each in value if isinstance(value, tuple) else (value,):
+            check(domain, **{name: each})
 
 
 def positive(name: str, value: float) -> float:

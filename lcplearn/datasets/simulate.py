@@ -89,7 +89,8 @@ def simulate_sliding_block(
     """
     sizes = [(trajectories, length), (validation_trajectories, length)]
     sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
-    _check_sizes(sizes, noise)
+    _check_sizes(sizes)
+    check(NOT_NEGATIVE, noise=noise, force_std=force_std, jitter=jitter, initial_speed=initial_speed)
     check(SHARE, switch_probability=switch_probability, share_from_rest=share_from_rest)
     if friction is not None and friction not in get_args(FrictionLabels):
         raise ValueError(f"friction: expected one of {', '.join(get_args(FrictionLabels))}, got {friction!r}")
@@ -138,7 +139,7 @@ def friction_labels(
     Returns:
         The pair [N].
 
-    Source: NOTES 6.
+    Source: NOTES 6.2.
     """
     limit = block.mu * block.mass * block.gravity
     if kind in ("lcp", "slack"):
@@ -196,7 +197,8 @@ def simulate_falling_block(
     """
     sizes = [(trajectories, length), (validation_trajectories, length)]
     sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
-    _check_sizes(sizes, noise)
+    _check_sizes(sizes)
+    check(NOT_NEGATIVE, noise=noise, initial_height=initial_height, initial_speed=initial_speed)
     block = FallingBlock(mass=mass, dt=dt, gravity=gravity)
     recordings: dict[str, Any] = {}
     for split, (name, (count, steps)) in enumerate(zip(_SPLITS, sizes, strict=True)):
@@ -257,11 +259,10 @@ def _force_std(block: SlidingBlock, draws: _Draws, force_std: float | None, shar
     return limit * 10**low
 
 
-def _check_sizes(sizes: list[tuple[int, int]], noise: float) -> None:
+def _check_sizes(sizes: list[tuple[int, int]]) -> None:
     for name, (count, steps) in zip(_SPLITS, sizes, strict=True):
         if count < 1 or steps < 1:
             raise ValueError(f"{name}: expected at least 1 trajectory of 1 step, got {count} of {steps}")
-    check(NOT_NEGATIVE, noise=noise)
 
 
 def _full_length(forces: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 
 from lcplearn.datasets.recordings import Recordings
 from lcplearn.datasets.task import Task
-from lcplearn.domains import NOT_NEGATIVE, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, check
 from lcplearn.scenes.scene import Drive
 from lcplearn.scenes.spring_block import SpringBlock
 
@@ -48,6 +48,7 @@ def simulate_spring_block(
     Raises:
         ValueError: An argument is out of range.
     """
+    check(POSITIVE, trajectories=trajectories, length=length, long_length=long_length)
     check(NOT_NEGATIVE, noise=noise, initial_stretch=initial_stretch, force_std=force_std)
     block = SpringBlock(mass=mass, mu=mu, stiffness=stiffness, dt=dt, gravity=gravity)
     sizes = {"train": (trajectories, length), "validation": (max(1, trajectories // 4), length)}

@@ -90,8 +90,9 @@ def check_recordings(name: str, part: Recordings, space: Space) -> None:
         raise ValueError(f"{name}.steps: expected numbers from 1 to {steps}, got {part.steps.tolist()}")
     valid = part.valid
     known = torch.cat((valid[:, :1], valid), dim=1)
-    for field_name, tensor, mask in (("states", states, known), ("drive.force", force, valid)):
-        if not bool(tensor[mask].isfinite().all()):
+    masks = {"states": known, "true_states": known, "drive.force": valid, "drive.friction": valid}
+    for field_name, tensor, _ in shapes:
+        if field_name in masks and tensor is not None and not bool(tensor[masks[field_name]].isfinite().all()):
             raise ValueError(f"{name}.{field_name}: expected finite numbers, got NaN or infinity")
 
 

@@ -152,9 +152,6 @@ class Formulation(nn.Module):
             self.temperature = 0.0
 
 
-FROM_TASK = ("space", "dt", "given", "gravity")  # constructor arguments that a task has
-
-
 def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
     """Build a model for a task: its space, dt and what is given come from the task, as far as the model asks for them.
 
@@ -170,4 +167,4 @@ def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
         "given": dict(task.given),
     }
     asked = inspect.signature(cls.__init__).parameters
-    return cls(**{name: known[name] for name in FROM_TASK if name in asked and known[name] is not None} | arguments)
+    return cls(**{name: value for name, value in known.items() if name in asked and value is not None} | arguments)

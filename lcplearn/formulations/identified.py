@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lcplearn.datasets.recordings import Windows
-from lcplearn.domains import REAL, SHARE, Domain
+from lcplearn.domains import Domain
 from lcplearn.formulations.formulation import Formulation
 from lcplearn.scenes.scene import Drive, Scene, Step
 from lcplearn.scenes.sliding_block import SlidingBlock
@@ -21,8 +22,8 @@ Number = float | Sequence[float] | Sequence[Sequence[float]]
 class Identified(Formulation):
     """Learn named numbers of a scene: the scene's own step, with parameters in their place.
 
-    A number stays in the domain that the scene declares for it (its `numbers`): positive ones are learned as their
-    logarithm, shares from 0 to 1 as their logit.
+    A number stays in the domain that the scene declares for it (its `numbers`): those with a lower end
+    only are learned as the logarithm of their distance from it, those between two ends as a logit.
 
     Args:
         scene: Class of the scene, or its dotted name: a dataclass with `numbers` and `advance`.
@@ -54,7 +55,7 @@ class Identified(Formulation):
         if unknown or not learn:
             got = unknown[0] if unknown else "none"
             raise ValueError(f"learn: expected numbers of {kind.__name__} ({', '.join(domains)}), got {got}")
-        known = {name: value for name, value in (given or {}).items() if name in fields and name not in learn}
+        known = {name: value for name, value in (given or {}).items() if name in fields.keys() - {"dt", *learn}}
         missing = [
             name
             for name, field in fields.items()
@@ -147,7 +148,8 @@ class Physical(Identified):
         learn, given = {"mu": initial_mu}, {"gravity": gravity}
         (learn if learn_mass else given)["mass"] = initial_mass
         super().__init__(scene=SlidingBlock, dt=dt, learn=learn, given=given)
-        self.given = {"gravity": gravity}  # a mass that isn't learned has no effect, so data may have another
+        # A mass that is not learned is for data without force, where it has no effect: they may have another.
+        self.given = {"gravity": gravity}
         self.register_load_state_dict_pre_hook(_rename)
 
 
@@ -179,9 +181,11 @@ def _free(name: str, value: Number, domain: Domain) -> nn.Parameter:
     inside = all(number in domain and number not in (domain.low, domain.high) for number in start.reshape(-1).tolist())
     if not inside:
         raise ValueError(f"{name}: expected {domain.words}, inside its bounds, got {value}")
-    if domain.low == REAL.low:
+    if math.isinf(domain.low):
         return nn.Parameter(start / domain.unit)
-    return nn.Parameter(start.logit() if domain is SHARE else start.log())
+    if math.isinf(domain.high):
+        return nn.Parameter((start - domain.low).log())
+    return nn.Parameter(((start - domain.low) / (domain.high - domain.low)).logit())
 
 
 def clip_rows(gradients: Float[Tensor, "N P"], most: float) -> Float[Tensor, "N P"]:
@@ -199,6 +203,8 @@ def _tensor(value: Any) -> Tensor:
 
 
 def _bound(free: Tensor, domain: Domain) -> Tensor:
-    if domain.low == REAL.low:
+    if math.isinf(domain.low):
         return free * domain.unit
-    return free.sigmoid() if domain is SHARE else free.exp()
+    if math.isinf(domain.high):
+        return domain.low + free.exp()
+    return domain.low + (domain.high - domain.low) * free.sigmoid()

@@ -78,7 +78,7 @@ def solve_lcp(
         >>> q.grad.tolist()
         [[-0.5, 0.0], [0.0, 0.0]]
 
-    Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992); lcp notes, sections 1 to 2.
+    Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992); NOTES 1 and 3.
     """
     if not (method == "auto" and tol is None and max_iter is None and smoothing == 0):
         check_options(method, tol, max_iter, smoothing)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.domains import POSITIVE, REAL, SHARE, Domain, check
+from lcplearn.domains import POSITIVE, REAL, SHARE, Domain, check_numbers
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.scene import Drive, Mode, Moving, Step
 from lcplearn.scenes.space import LINE, Space
@@ -40,7 +40,7 @@ class FallingBlock(Moving):
     gravity: float | Tensor = 9.81
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt)
+        check_numbers(self)
 
     def lcp(
         self, gap: Float[Tensor, "*#batch"], velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]
@@ -108,8 +108,7 @@ class BouncingBlock(Moving):
     gravity: float | Tensor = 9.81
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt)
-        check(SHARE, restitution=self.restitution)
+        check_numbers(self)
 
     def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step in contact: M [*#batch, 1, 1], q [*batch, 1], from velocity [m/s] and force [N]."""

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check_numbers
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.contact import Contacts, contact_step
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
@@ -58,7 +58,7 @@ class PlanarBlock:
     Source: NOTES 5.7.
     """
 
-    numbers: ClassVar[Mapping[str, Domain]] = {"mass": POSITIVE, "mu": NOT_NEGATIVE, "gravity": POSITIVE}
+    numbers: ClassVar[Mapping[str, Domain]] = {"mass": POSITIVE, "mu": NOT_NEGATIVE, "gravity": NOT_NEGATIVE}
 
     mass: Number | tuple[Number, Number]
     mu: Number
@@ -68,9 +68,7 @@ class PlanarBlock:
     m: int = 8
 
     def __post_init__(self) -> None:
-        for mass in self.mass if isinstance(self.mass, tuple) else (self.mass,):
-            check(POSITIVE, mass=mass)
-        check(POSITIVE, dt=self.dt)
+        check_numbers(self)
         if self.form not in ("exact", "facets", "traditional"):
             raise ValueError(f"form: expected 'exact', 'facets' or 'traditional', got {self.form!r}")
         if self.form != "exact" and (self.m < 3 or isinstance(self.mass, tuple)):

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check, check_numbers
 from lcplearn.scenes.contact import Contacts, ContactStep, RestitutionLaw, closing_speed, contact_step, rebound
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Step
@@ -58,7 +58,7 @@ class PlanarBody:
     rest: bool = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt, inertia=self.inertia)
+        check_numbers(self)
         if self.corners.ndim < 2 or self.corners.shape[-1] != 2:
             raise ValueError(f"corners: expected shape [*batch, C, 2], got {list(self.corners.shape)}")
 

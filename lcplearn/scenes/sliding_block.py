@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check, check_numbers
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.scene import Drive, Mode, Moving, Step
@@ -17,7 +17,7 @@ from lcplearn.scenes.space import LINE, Space
 from lcplearn.scenes.violation import violation
 
 Form = Literal["direct", "physical", "traditional"]
-NUMBERS = {"mass": POSITIVE, "mu": NOT_NEGATIVE, "gravity": POSITIVE}
+NUMBERS = {"mass": POSITIVE, "mu": NOT_NEGATIVE, "gravity": NOT_NEGATIVE}
 
 
 def slide(p: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "..."]:
@@ -52,7 +52,7 @@ class OneWayBlock(Moving):
         mass: Mass [kg]; > 0. Number or tensor that broadcasts over the batch, like mu.
         mu: Friction coefficient; >= 0.
         dt: Step size [s]; > 0.
-        gravity: Gravitational acceleration [m/s^2].
+        gravity: Gravitational acceleration [m/s^2]; >= 0.
 
     Source: Pfrommer's "LCP Notes" (2019), section 2.1, with general mass and forces in newtons; NOTES 5.3.
     """
@@ -64,11 +64,10 @@ class OneWayBlock(Moving):
     mass: float | Tensor
     mu: float | Tensor
     dt: float
-    gravity: float = 9.81
+    gravity: float | Tensor = 9.81
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt)
-        check(NOT_NEGATIVE, mu=self.mu)
+        check_numbers(self)
 
     def lcp(self, velocity: Float[Tensor, "*#batch"], force: Float[Tensor, "*#batch"]) -> tuple[Tensor, Tensor]:
         """The LCP of one step.
@@ -126,12 +125,11 @@ class SlidingBlock(Moving):
         mass: Mass [kg]; > 0. Number or tensor that broadcasts over the batch, like mu.
         mu: Friction coefficient; >= 0. (A negative one would make the direct form's v+ and v- both positive.)
         dt: Step size [s]; > 0.
-        gravity: Gravitational acceleration [m/s^2].
+        gravity: Gravitational acceleration [m/s^2]; >= 0.
         form: Which LCP.
-
-        temperature: Softening T of the threshold [m/s]; at 0 the LCP is solved. Above 0, T softplus((+-p - c) / T)
-            replaces (v+, v-): its gradient with respect to mu is nowhere zero, so that training may start with it where
-            no sample is predicted to slip, and anneal it to 0.
+        temperature: Softening T of the threshold [m/s]; >= 0. At 0 the LCP is solved. Above 0,
+            T softplus((+-p - c) / T) replaces (v+, v-): its gradient with respect to mu is nowhere zero, so that
+            training may start with it where no sample is predicted to slip, and anneal it to 0.
 
     Source: Pfrommer's "LCP Notes" (2019), sections 2.2 (direct) and 2.5 (traditional), with general mass and dt and
     forces in newtons; NOTES 5.4 to 5.6.
@@ -149,8 +147,8 @@ class SlidingBlock(Moving):
     temperature: float = 0.0
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt)
-        check(NOT_NEGATIVE, mu=self.mu)
+        check_numbers(self)
+        check(NOT_NEGATIVE, temperature=self.temperature)
         if self.form not in ("direct", "physical", "traditional"):
             raise ValueError(f"form: expected 'direct', 'physical' or 'traditional', got {self.form!r}")
 

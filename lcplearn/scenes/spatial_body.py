@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check, check_numbers
 from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, compiled_contacts, contact_step, rebound
 from lcplearn.scenes.contact_violation import Touch
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
@@ -74,9 +74,8 @@ class SpatialBody:
     rest: bool = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt, impact_speed=self.impact_speed)
-        for inertia in self.inertia if isinstance(self.inertia, tuple) else (self.inertia,):
-            check(POSITIVE, inertia=inertia)
+        check_numbers(self)
+        check(POSITIVE, impact_speed=self.impact_speed)
         if self.corners.ndim < 2 or self.corners.shape[-1] != 3:
             raise ValueError(f"corners: expected shape [*batch, C, 3], got {list(self.corners.shape)}")
 

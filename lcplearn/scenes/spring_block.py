@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check_numbers
 from lcplearn.lcp.solve import solve_lcp
-from lcplearn.scenes.scene import Drive, Mode, Moving, Step
+from lcplearn.scenes.scene import Drive, Moving, Step
+from lcplearn.scenes.sliding_block import move
 from lcplearn.scenes.space import LINE, Space
 
 
@@ -28,14 +29,16 @@ class SpringBlock(Moving):
         mu: Friction coefficient; >= 0.
         stiffness: Of the spring [N/m]; >= 0.
         dt: Step size [s]; > 0.
-        gravity: Gravitational acceleration [m/s^2].
+        gravity: Gravitational acceleration [m/s^2]; >= 0.
+
+    Source: Stewart and Trinkle 1996 (implicit in velocity and force); NOTES 5.4 is its case without a spring.
     """
 
     space: ClassVar[Space] = LINE
     contacts: ClassVar[int] = 1
     numbers: ClassVar[Mapping[str, Domain]] = {
-        **dict.fromkeys(("mass", "gravity"), POSITIVE),
-        **dict.fromkeys(("mu", "stiffness"), NOT_NEGATIVE),
+        "mass": POSITIVE,
+        **dict.fromkeys(("mu", "stiffness", "gravity"), NOT_NEGATIVE),
     }
 
     mass: float | Tensor
@@ -45,8 +48,7 @@ class SpringBlock(Moving):
     gravity: float | Tensor = 9.81
 
     def __post_init__(self) -> None:
-        check(POSITIVE, mass=self.mass, dt=self.dt)
-        check(NOT_NEGATIVE, mu=self.mu, stiffness=self.stiffness)
+        check_numbers(self)
 
     def advance(self, state: Float[Tensor, "*#batch 2"], drive: Drive) -> Step:
         """Next position and velocity, and contact mode: STICK or SLIP."""
@@ -57,5 +59,4 @@ class SpringBlock(Moving):
         M = inertia[..., None, None] * torch.eye(2, dtype=push.dtype, device=push.device)
         solution = solve_lcp(M, torch.stack((limit - push, limit + push), dim=-1), method="diagonal")
         velocity = solution.z[..., 0] - solution.z[..., 1]
-        mode = torch.where(velocity == 0, int(Mode.STICK), int(Mode.SLIP)).unsqueeze(-1)
-        return Step(torch.stack((position + self.dt * velocity, velocity), dim=-1), mode, solution, solution.solved)
+        return move(position, velocity, solution, self.dt)

@@ -29,7 +29,7 @@ def violation(
     Gradient:
         With respect to r and l, at fixed y: the derivative through the minimiser vanishes (envelope theorem).
 
-    Source: NOTES 6, losses.
+    Source: NOTES 6.5.
     """
     gate = (after.abs() / VIOLATION_WIDTH).clamp(max=1.0)
     sliding = -torch.sign(after) * limit

@@ -47,9 +47,9 @@ def _restored(arguments: Mapping[str, Any]) -> dict[str, Any]:
 def load(path: str | Path, map_location: str | torch.device | None = None, *, trust: bool = False) -> Any:
     """Load a trained model, ready to predict.
 
-    Only plain values are unpickled (`weights_only=True`). The model's class is imported by the name that stands in the
-    file. Importing runs code, so only lcplearn's own modules and those that are imported already are looked at, unless
-    the file is trusted.
+    Only plain values are unpickled (`weights_only=True`). The model's class, and that of its scene, are imported by the
+    names that stand in the file. Importing runs code, so only lcplearn's own modules and those that are imported
+    already are looked at, unless the file is trusted.
 
     Args:
         path: `best.ckpt` or `last.ckpt` of a run.
@@ -64,12 +64,14 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
             imported from elsewhere, or a parameter is not finite.
     """
     checkpoint = read(path, map_location)
+    for imported in (checkpoint["formulation"]["class"], checkpoint["formulation"]["arguments"].get("scene")):
+        module = str(imported or "").rpartition(".")[0]
+        if module and not (trust or module in sys.modules or module.startswith("lcplearn.")):
+            raise ValueError(
+                f"{path} was made with the class {imported}, and importing {module} runs its code: if you trust the "
+                f"file, import {module} first, or load with trust=True (--trust on a command line)."
+            )
     module, _, name = checkpoint["formulation"]["class"].rpartition(".")
-    if not (trust or module in sys.modules or module.startswith("lcplearn.")):
-        raise ValueError(
-            f"{path} was made with the class {module}.{name}, and importing {module} runs its code: if you trust the "
-            f"file, import {module} first, or load with trust=True (--trust on a command line)."
-        )
     ours = {cls.__name__: cls for cls in FORMULATIONS.values()}
     try:
         moved = module.startswith("lcplearn.formulations.") and name in ours

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, check
+
 
 @dataclass(frozen=True, kw_only=True)
 class Optimizer:
@@ -23,7 +25,7 @@ class Optimizer:
     Raises:
         ValueError: a value out of range.
 
-    Source: NOTES, sections 6 (the plateau) and 7.
+    Source: NOTES 6.4 (the plateau) and 6.6.
     """
 
     lr: float = 5e-2
@@ -33,12 +35,8 @@ class Optimizer:
     anneal_from: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("lr", "lbfgs_iterations", "anneal_from"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"optimizer.{name} must be positive, got {getattr(self, name)}.")
-        for name in ("lbfgs_after", "anneal_epochs"):
-            if (getattr(self, name) or 0) < 0:
-                raise ValueError(f"optimizer.{name} must be at least 0, got {getattr(self, name)}.")
+        check(POSITIVE, lr=self.lr, lbfgs_iterations=self.lbfgs_iterations, anneal_from=self.anneal_from)
+        check(NOT_NEGATIVE, lbfgs_after=self.lbfgs_after, anneal_epochs=self.anneal_epochs)
 
     def build(self, model: nn.Module) -> list[torch.optim.Optimizer]:
         """Adam, and LBFGS if it is asked for."""

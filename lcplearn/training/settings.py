@@ -18,8 +18,10 @@ TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
 FROM_DATA = {"dt", "gravity", "space", "given", "vertices", "com"}  # of a model, which takes them from its data
 UNLIKELY = {"min_epochs"}  # what nobody means who writes something alike
 # Ranges that the targets check too, seconds later: of data, model and optimizer.
-POSITIVE = {"dt", "mass", "trajectories", "length", "width", "initial_mass", "lr", "lbfgs_iterations", "shift"}
-AT_LEAST_0 = {"noise", "mu", "depth", "initial_noise", "initial_mu", "lbfgs_after", "anneal_epochs"}
+POSITIVE = {
+    *("dt", "mass", "trajectories", "length", "width", "initial_mass", "initial_mu", "lr", "lbfgs_iterations", "shift"),
+}
+AT_LEAST_0 = {"noise", "mu", "depth", "initial_noise", "lbfgs_after", "anneal_epochs"}
 TYPES = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,), "None": (type(None),), "Path": (str,)}
 
 

@@ -173,6 +173,8 @@ def test_falling_recordings_are_rollouts_of_the_scene_that_never_penetrate():
         ("train", {"trajectories": 0}),
         ("test_long", {"long_length": 0}),
         ("noise", {"noise": -0.1}),
+        ("jitter", {"jitter": math.nan}),
+        ("force_std", {"force_std": -1.0}),
         ("mu", {"mu": -0.1}),
         ("mass", {"mass": 0.0}),
         ("dt", {"dt": math.nan}),

@@ -107,6 +107,21 @@ def test_numbers_stay_in_the_domain_that_the_scene_declares() -> None:
     assert found["gravity"] == pytest.approx(-20.19)
 
 
+@dataclass(frozen=True)
+class Narrow(TwoBlocks):
+    """Has a number between two ends, which are not 0 and 1."""
+
+    numbers: ClassVar[Mapping[str, Domain]] = {"mu": Domain(0.2, 0.6, False, "a number from 0.2 to 0.6")}
+
+
+def test_a_number_stays_between_any_two_ends() -> None:
+    model = Identified(scene=Narrow, dt=0.1, learn={"mu": 0.3})
+    assert model.physical_parameters() == pytest.approx({"mu": 0.3})
+    with torch.no_grad():
+        model.free["mu"] += 30.0
+    assert model.physical_parameters() == pytest.approx({"mu": 0.6})
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

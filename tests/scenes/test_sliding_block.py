@@ -241,6 +241,8 @@ def test_the_gradient_of_the_closed_form_is_that_of_sticking_at_the_kink():
         ("dt", {"dt": 0.0}),
         ("mass", {"mass": -1.0}),
         ("mass", {"mass": math.nan}),
+        ("gravity", {"gravity": -9.81}),
+        ("temperature", {"temperature": -1.0}),
         ("form", {"form": "corrected"}),
     ],
 )

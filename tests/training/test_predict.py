@@ -208,6 +208,19 @@ def test_a_checkpoint_imports_no_module_that_is_not_trusted(
     del sys.modules["evil_module"]
 
 
+def test_a_checkpoint_imports_no_scene_that_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "evil_scene.py").write_text("from lcplearn.scenes import SlidingBlock\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = {"scene": "evil_scene.SlidingBlock", "dt": 0.1, "given": {"mass": 1.0}, "learn": {"mu": 0.5}}
+    saved = {"class": "lcplearn.formulations.identified.Identified", "arguments": arguments}
+    torch.save({"formulation": saved, "state_dict": {"model.free.mu": torch.zeros(())}}, tmp_path / "evil.ckpt")
+    with pytest.raises(ValueError, match="importing evil_scene runs its code"):
+        lcplearn.load(tmp_path / "evil.ckpt")
+    assert "evil_scene" not in sys.modules
+    assert lcplearn.load(tmp_path / "evil.ckpt", trust=True).physical_parameters() == {"mu": 1.0}
+    del sys.modules["evil_scene"]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
