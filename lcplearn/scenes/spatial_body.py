@@ -206,7 +206,7 @@ class SpatialBody:
 
 
 def box_corners(half_widths: Tensor, radius: Number = 0.0) -> Tensor:
-    """Centres [8, 3] of spheres of a radius [m] that fit into the corners of a box with half widths [3] [m]."""
+    """Centres [8, 3] of spheres of a radius [m] that fit into the corners of a box; half widths [3] in metres."""
     signs = torch.tensor(list(product((-1.0, 1.0), repeat=3)), dtype=half_widths.dtype, device=half_widths.device)
     inner = half_widths - (radius.unsqueeze(-1) if isinstance(radius, Tensor) else radius)
     return signs * inner.unsqueeze(-2)
