@@ -225,10 +225,14 @@ def _predict(options: argparse.Namespace) -> None:
         write(options.output, trajectory, model)
     if options.plot:
         _draw(inputs, trajectory, model).savefig(options.plot, dpi=120)
+    unsolved = 0 if trajectory.solved is None else int((~trajectory.solved).sum())
+    warning = (
+        f"; {unsolved} of all steps without a verified solution: don't trust what follows them" if unsolved else ""
+    )
     several = f"{len(trajectory.mode)} trajectories of " if trajectory.mode.ndim > 2 else ""
     print(
         f"{type(model).__name__}: {several}{steps} step{'s' * (steps > 1)} of {model.dt:.4g} s, "
-        f"at rest in {stuck:.0%} of them"
+        f"at rest in {stuck:.0%} of them{warning}"
     )
 
 

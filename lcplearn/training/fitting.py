@@ -66,6 +66,31 @@ class Result:
     folder: Path
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence, by message and for the time of a training, what a user can't act on."""
+    names = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "fabric.utilities.distributed")
+    loggers = [logging.getLogger(f"lightning.{name}") for name in names]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        for message in (
+            r".*isinstance\(treespec, LeafSpec\)",
+            r".*does not have many workers",
+            r".*smaller than the logging interval",
+            r".*Checkpoint directory .* exists and is not empty",
+            r".*The dirpath has changed from",
+        ):
+            warnings.filterwarnings("ignore", message=message)
+        for logger in loggers:
+            logger.setLevel(logging.WARNING)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+
+
+@_quiet()
 def fit(
     model: Formulation,
     data: Task,
@@ -119,7 +144,6 @@ def fit(
     if epochs < 1:
         raise ValueError(f"epochs: expected at least 1, got {epochs}")
     folder = _new_folder(folder)
-    _quiet()
     planned = plan(stages, loss=loss, horizon=horizon, epochs=epochs, lr=optimizer.lr)
     batches = windows(data.train, horizon)
     validation = windows(data.validation, horizon if data.chosen_by == "rollout" else None)
@@ -255,17 +279,3 @@ def _trainer_errors() -> Iterator[None]:
         yield
     except MisconfigurationException as error:
         raise ValueError(f"Lightning's Trainer can't use these settings: {' '.join(str(error).split())}") from error
-
-
-def _quiet() -> None:
-    """Silence, by message, what a user can't act on."""
-    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "fabric.utilities.distributed"):
-        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
-    for message in (
-        r".*isinstance\(treespec, LeafSpec\)",
-        r".*does not have many workers",
-        r".*smaller than the logging interval",
-        r".*Checkpoint directory .* exists and is not empty",
-        r".*The dirpath has changed from",
-    ):
-        warnings.filterwarnings("ignore", message=message)

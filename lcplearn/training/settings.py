@@ -204,7 +204,7 @@ def _known(key: str, known: Iterable[str], what: str, prefix: str = "") -> None:
 
 
 def _suggestion(key: str, known: Iterable[str], prefix: str = "") -> str:
-    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    close = difflib.get_close_matches(key, [name for name in known if name not in UNLIKELY], n=1, cutoff=0.5)
     if close:
         return f"did you mean '{prefix}{close[0]}'?"
     return f"known are {', '.join(sorted(prefix + name for name in known))}."

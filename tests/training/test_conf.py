@@ -180,6 +180,7 @@ def test_processes_of_torchrun_that_would_each_train_alone_are_refused(more: str
         ),
         ("data.gravity=1.62", "'data.gravity' is not set in conf/data; to add it, write +data.gravity=..."),
         ("model.widht=3", "Unknown setting 'model.widht'; did you mean 'model.width'?"),
+        ("trainer.epochs=3", "Unknown setting 'trainer.epochs'; did you mean 'trainer.max_epochs'?"),
         ("trainer.max_epoch=3", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),
         (
             "trainer.accumulate_grad_batches=2",

@@ -1,7 +1,9 @@
 """fit(): what it leaves, that it reproduces itself, and that it can be resumed."""
 
 import json
+import logging
 import signal
+import warnings
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -54,6 +56,14 @@ def test_a_run_leaves_figures_checkpoints_settings_and_pictures(tmp_path: Path) 
     assert metrics["rest_share"] is None  # slides only
     assert metrics["rollout_rmse_100"] is not None
     assert all(key in format_table(metrics) for key in KEYS if metrics[key] is not None)
+
+
+def test_a_training_leaves_the_warnings_and_loggers_of_the_process_as_they_were(tmp_path: Path) -> None:
+    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    before = (list(warnings.filters), logger.level)
+    task = tiny_data()
+    fit(Physical(dt=task.dt), task, epochs=1, folder=tmp_path, trainer=QUIET)
+    assert (list(warnings.filters), logger.level) == before
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path: Path) -> None:

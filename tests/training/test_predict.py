@@ -208,6 +208,17 @@ def test_a_checkpoint_imports_no_module_that_is_not_trusted(
     del sys.modules["evil_module"]
 
 
+def test_steps_without_a_solution_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With G = -I and f(v, u) < 0 the LCP 0 <= s, f + G s >= 0 has no solution."""
+    saved = {"class": "lcplearn.formulations.line.slack.Slack", "arguments": {"dt": 0.1}}
+    state = {"f_weight": torch.zeros(2, 2), "f_bias": -torch.ones(2), "G": -torch.eye(2)}
+    state = {f"model.{name}": value.double() for name, value in state.items()}
+    torch.save({"formulation": saved, "state_dict": state}, tmp_path / "unsolvable.ckpt")
+    (tmp_path / "forces.csv").write_text("force\n1\n2\n")
+    predict.main([str(tmp_path / "unsolvable.ckpt"), "--input", str(tmp_path / "forces.csv")])
+    assert "2 of all steps without a verified solution" in capsys.readouterr().out
+
+
 def test_a_checkpoint_imports_no_scene_that_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "evil_scene.py").write_text("from lcplearn.scenes import SlidingBlock\n")
     monkeypatch.syspath_prepend(tmp_path)
