@@ -195,7 +195,7 @@ def test_a_wrong_argument_is_named(name, arguments):
 def test_no_split_holds_a_recording_of_another(simulate):
     data = simulate()
     parts = [part for part in (data.train, data.validation, data.test, data.test_long) if part is not None]
-    drawn = [part.true_velocities[:, :20] for part in parts]
+    drawn = [part.true_states[:, :20, -1] for part in parts]
     for k, ours in enumerate(drawn):
         for theirs in drawn[k + 1 :]:
             moving = (ours != 0).any(1)
