@@ -24,7 +24,11 @@ RANK = 1e-10  # singular values below this share of the largest are those of red
 
 def attach_gradient(problem: Problem, found: Answer, buckets: list[tuple[Tensor, Tensor]]) -> Answer:
     """The answer as it is, with its gradient; buckets are elements [b] and their loaded contacts [b, K]."""
-    velocity, load, friction = problem.free, torch.zeros_like(found.normal), torch.zeros_like(found.friction)
+    # In flight nothing depends on the contacts: with a derivative of 0, not with none.
+    velocity = problem.free + 0.0 * (problem.target + problem.mu + problem.compliance).nan_to_num().sum(
+        -1, keepdim=True
+    )
+    load, friction = torch.zeros_like(found.normal), torch.zeros_like(found.friction)
     for elements, contacts in buckets:
         parts = _newton_step(problem.pick(elements, contacts), found.pick(elements, contacts))
         place = (elements.unsqueeze(-1), contacts)

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from training.helpers import ROOT
 
 from lcplearn.datasets import Recordings, Task, simulate_sliding_block
+from lcplearn.datasets.simulate_planar import simulate_planar_block, simulate_planar_body
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.formulations import FORMULATIONS, Formulation, build
 from lcplearn.formulations.pushing import PushModel
@@ -40,20 +41,29 @@ def settings(*overrides: str) -> dict[str, Any]:
 EVERY = [f"{group}={name}" for group in ("model", "loss", "optimizer", "trainer", "logger") for name in names(group)]
 EVERY += [f"experiment={name}" for name in names("experiment")] + ["data=cube_slides model=mlp"]
 EVERY = [choice.replace("model=identified", "data=spring model=identified") for choice in EVERY]
+EVERY = [choice.replace("model=planar", "data=planar_block model=planar") for choice in EVERY]
+EVERY = [
+    choice.replace("data=planar_block model=planar_body", "data=planar_body model=planar_body") for choice in EVERY
+]
 PUSHES = [choice for choice in EVERY if choice.startswith(("model=push_", "experiment=pushes_"))]
 EVERY = [choice for choice in EVERY if choice not in PUSHES]
 
 
 @pytest.fixture(scope="module")
 def tasks() -> dict[str, Task]:
-    """One of the spring, one of a tossed cube, and one of a sliding block for everything else."""
+    """By a part of the names of its configurations; one of a sliding block is for everything else."""
     state = torch.zeros(1, 2, 13, dtype=torch.float64)
     one = Recordings(state, Drive(torch.zeros(1, 1, 6, dtype=torch.float64)), torch.tensor([1]))
     given = {"half_width": 0.05, "mass": 0.4, "gravity": 9.81, "inertia": 8e-4, "mu": 0.2, "restitution": 0.1}
+    cube = Task(name="tosses", space=POSE, dt=0.01, train=one, validation=one, test=one, given=given)
     return {
-        "block": simulate_sliding_block(trajectories=1, long_length=1),
-        "spring": simulate_spring_block(trajectories=1, long_length=1),
-        "cube": Task(name="tosses", space=POSE, dt=0.01, train=one, validation=one, test=one, given=given),
+        "sliding_block": simulate_sliding_block(trajectories=1, long_length=1),
+        "data=spring": simulate_spring_block(trajectories=1, long_length=1),
+        "planar_body": simulate_planar_body(trajectories=1, length=2),
+        "planar": simulate_planar_block(trajectories=1, long_length=1),
+        "model=cube": cube,
+        "experiment=cube_body": cube,
+        "experiment=cube_corners": cube,
     }
 
 
@@ -62,9 +72,8 @@ def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, 
     chosen = settings(*choice.split())
     checks.check(chosen, CONF)
     asked = instantiate(chosen["model"], _partial_=True, _convert_="all")
-    cubes = ("model=cube", "experiment=cube_body", "experiment=cube_corners")
-    kind = "spring" if "data=spring" in choice else "cube" if choice.startswith(cubes) else "block"
-    assert isinstance(build(asked.func, tasks[kind], **asked.keywords), Formulation)
+    task = next((task for name, task in tasks.items() if name in choice), tasks["sliding_block"])
+    assert isinstance(build(asked.func, task, **asked.keywords), Formulation)
     assert isinstance(instantiate(chosen["optimizer"], _convert_="all"), Optimizer)
 
 
@@ -79,7 +88,7 @@ def test_every_model_of_pushes_passes_the_check_and_is_built(choice: str) -> Non
 def test_every_formulation_has_a_configuration() -> None:
     others = [name for name in names("model") if not name.startswith("push_")]
     targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in others}
-    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified", "CubeCorners"}
+    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified", "CubeCorners", "PlanarFriction"}
 
 
 def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:

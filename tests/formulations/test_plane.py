@@ -1,0 +1,50 @@
+"""Learning friction in the plane: the truth is a fixed point, sticks survive errors, and recordings follow the law."""
+
+import pytest
+import torch
+
+from lcplearn.datasets.simulate_planar import simulate_planar_block, simulate_planar_body
+from lcplearn.formulations.formulation import build
+from lcplearn.formulations.identified import Identified
+from lcplearn.formulations.plane import PlanarFriction
+from lcplearn.scenes.scene import Drive
+from lcplearn.scenes.space import PLANE
+
+
+def test_the_true_numbers_and_the_structured_model_reproduce_the_recordings():
+    task = simulate_planar_block(trajectories=4, test_trajectories=4, long_trajectories=1, long_length=5)
+    structured = build(PlanarFriction, task, initial_limit=0.4 * 9.81)
+    with torch.no_grad():
+        structured.weight[:, 2:] /= 1.5
+    exact = build(Identified, task, scene="lcplearn.scenes.planar_block.PlanarBlock", learn=dict(task.truth))
+    for model in (structured, exact):
+        before, after = task.test.states[:, :-1], task.test.states[:, 1:]
+        predicted = model.advance(before, Drive(task.test.drive.force)).state
+        torch.testing.assert_close(predicted, after, rtol=0, atol=1e-13)
+        assert ((predicted[..., 2:] == 0) == (after[..., 2:] == 0)).all()
+
+
+def test_sticks_survive_errors_of_what_is_learned():
+    task = simulate_planar_block(trajectories=1, test_trajectories=20, long_trajectories=1, long_length=5)
+    model = build(PlanarFriction, task, initial_limit=0.4 * 9.81)
+    with torch.no_grad():
+        model.weight[:, 2:] /= 1.5
+        model.weight += 1e-3 * torch.randn(2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        predicted = model.advance(task.test.states[:, :-1], Drive(task.test.drive.force)).state[..., 2:]
+    sticks = (task.test.states[:, 1:, 2:] == 0).all(-1)
+    assert sticks.any()
+    assert (predicted[sticks] == 0).all(-1).double().mean() > 0.99
+
+
+def test_a_tossed_rectangle_is_reproduced_by_its_true_numbers_and_gives_them_gradients():
+    task = simulate_planar_body(trajectories=3, length=40)
+    model = build(Identified, task, scene="lcplearn.scenes.planar_body.PlanarBody", learn=dict(task.truth))
+    after = model.advance(task.test.states[:, :-1], Drive(task.test.drive.force)).state
+    torch.testing.assert_close(after, task.test.states[:, 1:], rtol=0, atol=1e-10)
+    gradients = torch.autograd.grad(after.square().sum(), list(model.parameters()))
+    assert all(gradient.abs() > 0 for gradient in gradients)
+
+
+def test_the_planar_model_refuses_another_space():
+    with pytest.raises(ValueError, match="space: expected TABLE"):
+        PlanarFriction(dt=0.05, space=PLANE)
