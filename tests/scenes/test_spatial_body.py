@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lcplearn.scenes import SlidingBlock
 from lcplearn.scenes.scene import Drive, Mode, rollout
 from lcplearn.scenes.space import POSE, quaternion_product, rotation_matrix
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
@@ -87,6 +88,46 @@ def test_a_box_rests_exactly(slope):
             step = scene.advance(state, NOTHING)
             assert (step.state == REST).all()  # a fixed point: what 20 steps leave as it is, 10,000 do
             state = step.state
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_a_box_is_exactly_at_rest_for_10000_steps(slope):
+    pytest.importorskip("numba")
+    gravity = 9.81 * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)])
+    path = body(gravity=gravity, mu=0.3).rollout(REST, Drive(torch.zeros(10_000, 6)))
+    assert path.solved.all()
+    assert (path.positions == REST[:7]).all()
+    assert (path.velocities == 0.0).all()
+
+
+def test_a_box_on_a_slope_sticks_just_above_the_friction_angle_and_slides_just_below():
+    slope = 0.3
+    gravity = 9.81 * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)])
+    for factor, sticks in ((1 + 1e-9, True), (1 - 1e-9, False)):
+        with torch.no_grad():
+            step = body(gravity=gravity, mu=factor * math.tan(slope)).advance(REST, NOTHING)
+        assert step.solved
+        if sticks:
+            assert (step.state == REST).all()
+        else:
+            expected = 0.01 * 9.81 * math.sin(slope) * 1e-9
+            assert float(step.state[7]) == pytest.approx(expected, rel=1e-4)
+            assert Mode.SLIP in step.mode
+
+
+def test_a_flat_box_slides_straight_as_the_block_in_one_dimension():
+    force = 2.0 * torch.randn(10, 40, generator=torch.Generator().manual_seed(1))
+    block = SlidingBlock(mass=0.4, mu=0.4, dt=0.01).rollout(torch.zeros(10, 2), force.unsqueeze(-1))
+    # so low that a push at the centre of mass tips nothing
+    flat = body(corners=box_corners(torch.tensor([0.05, 0.06, 0.001])))
+    start = torch.cat((REST[:2], torch.tensor([0.001]), REST[3:])).expand(10, 13)
+    with torch.no_grad():
+        path = flat.rollout(start, Drive(torch.nn.functional.pad(force.unsqueeze(-1), (0, 5))))
+    assert path.solved.all()
+    torch.testing.assert_close(path.velocities[..., 0], block.velocities[..., 0], rtol=0, atol=1e-9)
+    assert ((path.velocities[..., 0] == 0.0) == (block.velocities[..., 0] == 0.0)).all()
+    assert (block.velocities[..., 0] == 0.0).any()
+    assert (path.velocities[..., 1:].abs() < 1e-9).all()
 
 
 def test_a_rotation_about_the_vertical_rotates_the_motion():

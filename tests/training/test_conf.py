@@ -108,7 +108,7 @@ def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
         ("trainer.max_epochs=two", "trainer.max_epochs must be int or None, got 'two'."),
         ("+trainer.max_epoch=2", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),
         ("loss.prediction=-1", "loss.prediction must be finite and at least 0, got -1."),
-        ("+loss.mse=1", "Unknown setting 'loss.mse'; known are loss.complementarity"),
+        ("+loss.huber=1", "Unknown setting 'loss.huber'; known are loss.complementarity"),
         ("loss.prediction=0", "All loss weights are zero"),
         ("loss.horizon=0", "loss.horizon must be at least 1, got 0."),
         ("batch_size=64", "LBFGS needs the full batch: set batch_size=null, or optimizer=adam."),
