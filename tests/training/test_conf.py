@@ -175,7 +175,7 @@ def test_processes_of_torchrun_that_would_each_train_alone_are_refused(more: str
     ("overrides", "sentence"),
     [
         ("modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
-        ("noise=1", "Unknown setting 'noise'; did you mean 'data.noise'?"),
+        ("noise=1", "Unknown setting 'noise'; did you mean 'data.noise' or 'model.noise'?"),
         ("data.path=x", "'data.path' is a setting of another data= than the chosen one."),
         (
             "model=affine,mlp",
