@@ -2,6 +2,7 @@
 
 import copy
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from real_data import real_data
 
 from lcplearn.datasets.pushes import PushData, read_all_pushes
 from lcplearn.formulations.pushing import PushMLP, Residual, Ridge, Supports
+from lcplearn.training.checkpoint import load
 
 F = torch.float64
+CHECKPOINTS = Path(__file__).parents[2] / "data" / "checkpoints"
 
 
 def thing(data: PushData) -> dict:
@@ -91,6 +94,18 @@ def test_a_prediction_does_not_depend_on_the_other_pushes(data, known, kind):
     with torch.no_grad():
         together, alone = model.predict(data.pushes).pose, model.predict(data.pushes.take([7])).pose
     torch.testing.assert_close(alone[0], together[7], atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["pushes_supports", "pushes_residual"])
+def test_shipped_checkpoints_predict(data, name):
+    """A checkpoint knows its surfaces and numbers by name: it must load after any change of the models."""
+    model = load(CHECKPOINTS / f"{name}.ckpt")
+    pushes = data.pushes.take(torch.arange(2))._replace(surface=("hardboard", "wood"))
+    with torch.no_grad():
+        prediction = model.predict(pushes)
+    assert prediction.solved.all()
+    moved = model.motion(pushes, prediction.pose).norm(dim=-1)
+    assert ((moved > 0.002) & (moved < 0.03)).all()  # the finger goes 12 mm from the first touch on
 
 
 def test_an_unknown_surface_is_refused_by_name(data, known):

@@ -182,12 +182,10 @@ def test_a_finger_that_passes_the_corner_leaves():
     assert (path.poses[0, -1] == path.poses[0, -5]).all()
 
 
-def test_a_high_finger_lifts_a_support_and_what_is_not_solved_is_said():
-    path = triangle().rollout(random_pushes(100), triangle_grip(100, height=0.04))
+@pytest.mark.parametrize("height", [0.04, 0.12])  # at the second the triangle would tip
+def test_a_high_finger_lifts_a_support_and_every_step_is_solved(height):
+    path = triangle().rollout(random_pushes(100), triangle_grip(100, height=height))
     assert path.solved.all()
-    path = triangle().rollout(random_pushes(100), triangle_grip(100, height=0.12))  # the triangle would tip
-    assert path.solved.double().mean() > 0.99
-    assert not path.solved.all()
     assert path.poses.isfinite().all()
 
 

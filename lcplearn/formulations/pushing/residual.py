@@ -13,7 +13,7 @@ from lcplearn.scenes.pushed_object import rotate
 from lcplearn.scenes.pushes import Outcome, Pushes
 
 MM = 1e3
-# Chosen by cross-validation over the shared pushes; docs/pushes.md has the figures.
+# Which functions vary: a choice that has not been compared with others here (docs/pushes.md).
 INSIDE: Terms = {
     "offset": ("all", "configuration"),
     "log_mu": ("configuration", "contact"),
@@ -31,7 +31,7 @@ class Residual(PushModel):
     Two Gaussian processes over contact, direction, place and configuration are learned from what `Supports` leaves.
     The first is inside the rollout: end poses are linear in its latents through the rollout's Jacobian, and its
     posterior mean goes into the rollout itself. The second corrects end poses alone. The prediction is the mean of
-    both; it is better than either, because their length scales differ.
+    both.
 
     Args:
         vertices, com, mass: The object.
