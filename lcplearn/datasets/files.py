@@ -19,7 +19,7 @@ def find(name: str) -> Path:
     if not path.is_file():
         raise FileNotFoundError(
             f"{path}: no such file; `python -m lcplearn.datasets.get slides|tosses|pushes` brings published recordings "
-            "(see data/README.md), and LCPLEARN_DATA can name their folder"
+            "(see data/README.md), and LCPLEARN_DATA can name its folder"
         )
     return path
 

@@ -140,4 +140,4 @@ def _announce_compilation() -> None:
     folder = getattr(solve_range.stats, "cache_path", None)
     cached = folder is not None and os.path.isdir(folder) and any(f.startswith("cascade.") for f in os.listdir(folder))
     if not cached:
-        sys.stderr.write("lcplearn: compiling the LCP kernel, once per machine (10-20 s)\n")
+        sys.stderr.write("lcplearn: compiling the LCP kernel, once on a machine: a minute or more\n")
