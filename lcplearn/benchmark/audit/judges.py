@@ -1,9 +1,10 @@
 """What is known about a problem, held against what was answered. Nothing here uses the solver's own residual."""
 
 from fractions import Fraction
-from itertools import product
 
 import numpy as np
+
+from lcplearn.benchmark.fuzz.checks import enumerate_solution
 
 ROUNDING = {np.dtype(np.float64): 1e-10, np.dtype(np.float32): 4e-6}  # relative error of data that is allowed
 
@@ -89,15 +90,8 @@ def wrong_for_integers(M: np.ndarray, q: np.ndarray, z: np.ndarray, basis: np.nd
 
 
 def has_solution(M: np.ndarray, q: np.ndarray) -> bool:
-    """Whether an LCP of small integers has a solution: some pattern of (z_i > 0, w_i > 0, both zero) is one."""
-    for pattern in product((0, 1, 2), repeat=len(q)):
-        positive, tight = np.array(pattern) == 2, np.array(pattern) >= 1
-        z = np.zeros(len(q))
-        if positive.any():
-            z[positive] = np.linalg.lstsq(M[np.ix_(tight, positive)], -q[tight], rcond=1e-10)[0]
-        if np.abs(np.minimum(z, M @ z + q)).max() < 1e-9:
-            return True
-    return False
+    """Whether an LCP of small integers has a solution, by enumeration."""
+    return enumerate_solution(M, q) is not None
 
 
 def false_certificate(M: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.ndarray:
