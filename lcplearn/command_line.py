@@ -7,7 +7,6 @@ import itertools
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationResolutionError
 
+from lcplearn import __version__
 from lcplearn.training.settings import SettingsError, check
 
 SWEEP = ("-m", "--multirun")
@@ -98,7 +98,7 @@ def _link(folder: Path, latest: Path) -> None:
 
 def version_line() -> str:
     """Name and version."""
-    return f"lcplearn {version('lcplearn')}"
+    return f"lcplearn {__version__}"
 
 
 def _jobs(overrides: Sequence[Override], sweep: bool) -> Iterator[list[str]]:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+PUBLISHED = {"cube_slides.npz": "slides", "cube_tosses.npz": "tosses", "planar_pushes.npz": "pushes"}
+
 
 def find(name: str) -> Path:
     """Path of a data file, in the folder named by LCPLEARN_DATA or else in data/.
@@ -17,9 +19,10 @@ def find(name: str) -> Path:
     """
     path = Path(os.environ.get("LCPLEARN_DATA") or "data") / name
     if not path.is_file():
+        what = PUBLISHED.get(name, "|".join(PUBLISHED.values()))
         raise FileNotFoundError(
-            f"{path}: no such file; `python -m lcplearn.datasets.get slides|tosses|pushes` brings published recordings "
-            "(see data/README.md), and LCPLEARN_DATA can name its folder"
+            f"{path}: no such file; `python -m lcplearn.datasets.get {what}` "
+            "brings published recordings (see data/README.md), and LCPLEARN_DATA can name its folder"
         )
     return path
 

@@ -86,7 +86,7 @@ def test_the_split_depends_on_the_seed_only(tmp_path):
 
 def test_a_missing_file_is_named_with_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setenv("LCPLEARN_DATA", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match=r"cube_slides.npz: no such file; `python -m lcplearn.datasets.get"):
+    with pytest.raises(FileNotFoundError, match=r"no such file; `python -m lcplearn.datasets.get slides`"):
         find("cube_slides.npz")
     with pytest.raises(FileNotFoundError, match=r"cube_slides.npz: no such file"):
         read_cube_slides()
