@@ -125,11 +125,8 @@ class Formulation(nn.Module):
         return c * ((1.0 + squared / c**2).sqrt() - 1.0)
 
     def _predicted(self, windows: Windows) -> Float[Tensor, "B k nq_plus_nv"]:
-        scene, state, predicted = self.moving_each(len(windows.valid)), windows.states[:, 0], []
-        for k in range(windows.valid.shape[1]):
-            state = scene.advance(state, windows.drive.at(k)).state
-            predicted.append(state)
-        return torch.stack(predicted, dim=-2)
+        path = rollout(self.moving_each(len(windows.valid)), windows.states[:, 0], windows.drive)
+        return torch.cat((path.positions, path.velocities), dim=-1)[:, 1:]
 
     def velocity_error(
         self, predicted: Float[Tensor, "*batch nq_plus_nv"], measured: Float[Tensor, "*batch nq_plus_nv"]

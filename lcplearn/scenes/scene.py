@@ -81,7 +81,8 @@ class Scene(Protocol):
     A scene may have more, which is used where it is there: `numbers`, a mapping from the names of its constructor's
     numbers to their `Domain` (`Identified` learns them); `violation(state, drive, after)`, how badly the best contact
     force explains a measured step [m^2/s^2], [*batch] (a loss); a constructor argument `temperature`, which softens
-    its thresholds in training; `length` [m], which weighs rotations against translations.
+    its thresholds in training; `length` [m], which weighs rotations against translations; `fused_rollout(state,
+    drive)`, a rollout by other means than step after step, or None where it can't (see `rollout`).
 
     Attributes:
         space: What a state is.
@@ -138,6 +139,9 @@ def rollout(scene: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], drive: Dri
     if force.ndim < 2 or force.shape[-2] == 0:
         raise ValueError(f"forces: expected shape [*batch, T, {space.nv}] with T >= 1, got {list(force.shape)}")
     space.split(state)
+    fused = getattr(scene, "fused_rollout", None)
+    if fused is not None and (path := fused(state, drive)) is not None:
+        return path
     batch = torch.broadcast_shapes(state.shape[:-1], force.shape[:-2])
     state = state.expand(*batch, state.shape[-1])
     states, modes, solved = [state], [], []

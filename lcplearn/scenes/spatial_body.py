@@ -91,7 +91,7 @@ class SpatialBody:
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one step; the mode is that of each corner."""
-        path = self._compiled(state, drive.force.unsqueeze(-2))
+        path = self.fused_rollout(state, drive.map(lambda values: values.unsqueeze(-2)))
         if path is not None:
             state = torch.cat((path.positions[..., 1, :], path.velocities[..., 1, :]), dim=-1)
             return Step(state, path.mode[..., 0, :], None, None if path.solved is None else path.solved[..., 0])
@@ -108,25 +108,19 @@ class SpatialBody:
         return Step(state, found.mode, None, found.solved & found.settled)
 
     def rollout(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Trajectory:
-        """As `scene.rollout`, in one compiled loop where that is possible: on the CPU, without gradients."""
-        path = self._compiled(state, drive.force)
-        return rollout(self, state, drive) if path is None else path
+        """As `scene.rollout`."""
+        return rollout(self, state, drive)
 
-    def _compiled(self, state: Tensor, force: Tensor) -> Trajectory | None:
-        """The rollout of force [*batch, T, 6] by `spatial_kernel`; None where it can't be."""
-        numbers = (self.radius, self.restitution, self.mu, self.mu if self.mu_impact is None else self.mu_impact)
-        tensors = [x for x in (*vars(self).values(), state, force) if isinstance(x, Tensor)]
-        tensors += [x for x in self.inertia if isinstance(x, Tensor)] if isinstance(self.inertia, tuple) else []
+    def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
+        """The same in one compiled loop, forwards and backwards; None where that can't be: not on the CPU, ..."""
+        force = drive.force
         if self.polygon is not None or compiled_contacts(state.device) is None:
             return None
-        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+        if state.dtype is not torch.float64 or force.dtype is not torch.float64:
             return None
-        if any(x.dtype is not torch.float64 for x in (state, force)):
-            return None
-        from lcplearn.scenes.spatial_kernel import roll
-
         POSE.split(state)
         mass = self._mass(state)
+        numbers = (self.radius, self.restitution, self.mu, self.mu if self.mu_impact is None else self.mu_impact)
         compliance = as_tensor(self.compliance, state) / as_tensor(self.mass, state)
         given = stack_numbers(*numbers, self.ground, compliance, like=state)
         shapes = (state.shape[:-1], force.shape[:-2], self.corners.shape[:-2], mass.shape[:-1], given.shape[:-1])
@@ -136,20 +130,25 @@ class SpatialBody:
         def flat(x: Tensor, *shape: int) -> Tensor:
             return x.expand(*batch, *shape).reshape(batch.numel(), *shape).double()
 
-        states, mode, solved = roll(
+        from lcplearn.scenes.spatial_adjoint import roll_out
+        from lcplearn.scenes.spatial_kernel import Options
+
+        found = roll_out(
+            Options(
+                dt=self.dt,
+                newton=self.restitution_law == "newton",
+                gyroscopic=isinstance(self.inertia, tuple),
+                rest=self.rest,
+                impact_speed=self.impact_speed,
+            ),
             flat(state, 13),
             flat(force, *force.shape[-2:]),
             flat(self.corners, self.contacts, 3),
             flat(mass, 6),
             flat(given, 6),
             flat(down, 3),
-            dt=self.dt,
-            newton=self.restitution_law == "newton",
-            gyroscopic=isinstance(self.inertia, tuple),
-            rest=self.rest,
-            impact_speed=self.impact_speed,
         )
-        states, mode, solved = (x.reshape((*batch, *x.shape[1:])) for x in (states, mode, solved))
+        states, mode, solved = (x.reshape((*batch, *x.shape[1:])) for x in found)
         return Trajectory(*POSE.split(states), mode, solved)
 
     def touch_at(self, position: Float[Tensor, "*#batch 7"]) -> Touch:

@@ -1,20 +1,22 @@
 """Steps and rollouts of bodies in space on the CPU, compiled: `spatial_body.py` without gradients."""
 
+from collections.abc import Sequence
 from math import cos, sin, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lcplearn.scenes.contact_kernel import call, compiled, contacts_address, fingerprint, solver_address
 
-_SMALL = 1e-8  # squared half angle below which series are exact; as in space.py
+SMALL = 1e-8  # squared half angle below which series are exact; as in space.py
 STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
 
 
 @compiled
-def _rotation(q, R):
+def rotation(q, R):
+    """The matrix of a unit quaternion."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
@@ -27,7 +29,7 @@ def _turn(q, w, dt):
     a, b, c = dt * w[0], dt * w[1], dt * w[2]
     square = (a * a + b * b + c * c) / 4.0
     half = sqrt(square)
-    if square < _SMALL:
+    if square < SMALL:
         cosine, sinc = 1.0 - square / 2.0, 1.0 - square / 6.0
     else:
         cosine, sinc = cos(half), sin(half) / half
@@ -62,11 +64,43 @@ def _midpoint_spin(w, inertia, dt):
     w[0], w[1], w[2] = 2.0 * x - w[0], 2.0 * y - w[1], 2.0 * z - w[2]
 
 
+@compiled
+def approach(
+    x, R, gravity, force, corners, mass, numbers, dt, newton, gyroscopic, free, normal, tangents, gap, closing
+):  # fmt: skip
+    """Free velocity, rows, gaps and closing speeds of all corners at a state x."""
+    radius, ground = numbers[0], numbers[4]
+    for i in range(3):
+        free[i] = x[7 + i] + dt * (gravity[i] + force[i] / mass[i])
+        free[3 + i] = x[10 + i]
+    if gyroscopic:
+        _midpoint_spin(free[3:], mass[3:], dt)
+    for i in range(3):
+        free[3 + i] += dt * force[3 + i] / mass[3 + i]
+    for i in range(len(corners)):
+        c = corners[i]
+        gap[i] = x[2] + R[2, 0] * c[0] + R[2, 1] * c[1] + R[2, 2] * c[2] - radius - ground
+        r0, r1, r2 = c[0] - radius * R[2, 0], c[1] - radius * R[2, 1], c[2] - radius * R[2, 2]
+        for d in range(3):
+            row = normal[i] if d == 2 else tangents[i, d]
+            row[0], row[1], row[2] = 1.0 * (d == 0), 1.0 * (d == 1), 1.0 * (d == 2)
+            row[3] = r1 * R[d, 2] - r2 * R[d, 1]
+            row[4] = r2 * R[d, 0] - r0 * R[d, 2]
+            row[5] = r0 * R[d, 1] - r1 * R[d, 0]
+        before = after_free = 0.0
+        for k in range(6):
+            before += normal[i, k] * x[7 + k]
+            after_free += normal[i, k] * free[k]
+        if newton:
+            closing[i] = max(-before, 0.0) if gap[i] + dt * after_free < 0.0 else 0.0
+        else:
+            closing[i] = max(-before - max(gap[i], 0.0) / dt, 0.0)
+
+
 def _make_roll(sources: str) -> Any:
     def _roll(
-        contacts, address, dt, newton, gyroscopic, rest, impact_speed, start,
-        force, corners, mass, numbers, gravity, states, modes,
-        solved,
+        contacts, address, dt, newton, gyroscopic, rest, impact_speed, start, force, corners, mass, numbers, gravity,
+        states, modes, solved, loads, frictions, sticking,
     ):  # fmt: skip
         """T steps of each element; numbers are radius, restitution, mu, mu_impact, ground, compliance."""
         sources  # noqa: B018, for the cache
@@ -78,47 +112,26 @@ def _make_roll(sources: str) -> Any:
         free_now, mass_now, v_now = np.empty((1, 6)), np.empty((1, 6)), np.empty((1, 6))
         flags = np.empty((1, 3), np.bool_)
         free, v = free_now[0], v_now[0]
-        R, q = np.empty((3, 3)), np.empty(4)
+        R, q, gap, closing = np.empty((3, 3)), np.empty(4), np.empty(C), np.empty(C)
         for b in range(B):
             states[b, 0] = start[b]
             mass_now[0] = m = mass[b]
-            radius, restitution, mu, mu_impact = numbers[b, 0], numbers[b, 1], numbers[b, 2], numbers[b, 3]
-            ground, compliance = numbers[b, 4], numbers[b, 5]
+            restitution, mu, mu_impact, compliance = numbers[b, 1], numbers[b, 2], numbers[b, 3], numbers[b, 5]
             for t in range(T):
                 x, after = states[b, t], states[b, t + 1]
                 for i in range(4):
                     q[i] = x[3 + i]
-                _rotation(q, R)
-                for i in range(3):
-                    free[i] = x[7 + i] + dt * (gravity[b, i] + force[b, t, i] / m[i])
-                    free[3 + i] = x[10 + i]
-                if gyroscopic:
-                    _midpoint_spin(free[3:], m[3:], dt)
-                for i in range(3):
-                    free[3 + i] += dt * force[b, t, 3 + i] / m[3 + i]
+                rotation(q, R)
+                approach(
+                    x, R, gravity[b], force[b, t], corners[b], m, numbers[b], dt, newton, gyroscopic, free, normal[0],
+                    tangents[0], gap, closing,
+                )  # fmt: skip
                 for i in range(C):
-                    c = corners[b, i]
-                    gap = x[2] + R[2, 0] * c[0] + R[2, 1] * c[1] + R[2, 2] * c[2] - radius - ground
-                    r0, r1, r2 = c[0] - radius * R[2, 0], c[1] - radius * R[2, 1], c[2] - radius * R[2, 2]
-                    before = after_free = 0.0
-                    for d in range(3):
-                        row = normal[0, i] if d == 2 else tangents[0, i, d]
-                        row[0], row[1], row[2] = 1.0 * (d == 0), 1.0 * (d == 1), 1.0 * (d == 2)
-                        row[3] = r1 * R[d, 2] - r2 * R[d, 1]
-                        row[4] = r2 * R[d, 0] - r0 * R[d, 2]
-                        row[5] = r0 * R[d, 1] - r1 * R[d, 0]
-                    for k in range(6):
-                        before += normal[0, i, k] * x[7 + k]
-                        after_free += normal[0, i, k] * free[k]
-                    if newton:
-                        closing = max(-before, 0.0) if gap + dt * after_free < 0.0 else 0.0
-                    else:
-                        closing = max(-before - max(gap, 0.0) / dt, 0.0)
-                    bounce = restitution * closing
+                    bounce = restitution * closing[i]
                     if newton and bounce > 0.0:
-                        bounce = max(bounce + gap / dt, 0.0)
-                    target[0, i] = bounce - gap / dt
-                    friction_mu[0, i] = mu + (mu_impact - mu) * min(closing / impact_speed, 1.0)
+                        bounce = max(bounce + gap[i] / dt, 0.0)
+                    target[0, i] = bounce - gap[i] / dt
+                    friction_mu[0, i] = mu + (mu_impact - mu) * min(closing[i] / impact_speed, 1.0)
                     soft[0, i] = compliance
                 call(
                     contacts,
@@ -133,6 +146,8 @@ def _make_roll(sources: str) -> Any:
                     modes[b, t, i] = SEPARATION
                     if load[0, i] > 0.0:
                         modes[b, t, i] = STICK if at_rest or sticks[0, i] else SLIP
+                if len(loads):  # somebody will ask for the gradient
+                    loads[b, t], frictions[b, t], sticking[b, t] = load[0], friction[0], sticks[0]
                 for k in range(6):
                     after[7 + k] = 0.0 if at_rest else v[k]
                 if not at_rest:
@@ -148,37 +163,45 @@ def _make_roll(sources: str) -> Any:
 _roll = _make_roll(fingerprint("contact_kernel.py", "spatial_kernel.py"))
 
 
-def roll(
-    start: Tensor,
-    force: Tensor,
-    corners: Tensor,
-    mass: Tensor,
-    numbers: Tensor,
-    gravity: Tensor,
-    *,
-    dt: float,
-    newton: bool,
-    gyroscopic: bool,
-    rest: bool,
-    impact_speed: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+class Options(NamedTuple):
+    """What is the same for all elements: as in `SpatialBody`; gyroscopic: with moments of inertia that differ."""
+
+    dt: float
+    newton: bool
+    gyroscopic: bool
+    rest: bool
+    impact_speed: float
+
+
+class Rolled(NamedTuple):
+    """Steps of a batch, and what of each contact a gradient needs (empty unless it is asked for).
+
+    Shapes: states [B, T + 1, 13]; modes, loads, sticks [B, T, C]; solved [B, T]; frictions [B, T, C, 2].
+    """
+
+    states: NDArray
+    modes: NDArray
+    solved: NDArray
+    loads: NDArray
+    frictions: NDArray
+    sticks: NDArray
+
+
+def roll(given: Sequence[Tensor], options: Options, *, keep: bool = False) -> Rolled:
     """T steps of a batch of bodies.
 
     Args:
-        start: [B, 13].
-        force: [B, T, 6].
-        corners: [B, C, 3].
-        mass: Diagonal of the mass matrix [B, 6].
-        numbers: radius, restitution, mu, mu_impact, ground, compliance / mass [B, 6].
-        gravity: [B, 3].
-
-    Returns:
-        States [B, T + 1, 13], modes [B, T, C] and whether each step is right [B, T].
+        given: start [B, 13], force [B, T, 6], corners [B, C, 3], diagonal of the mass matrix [B, 6], the numbers
+            radius, restitution, mu, mu_impact, ground and compliance / mass [B, 6], and gravity [B, 3].
+        options: The rest.
+        keep: Whether a gradient will be asked for.
     """
+    start, force, corners, mass, numbers, gravity = (x.detach().contiguous().numpy() for x in given)
     B, T, C = len(start), force.shape[1], corners.shape[1]
-    states, modes, solved = np.empty((B, T + 1, 13)), np.empty((B, T, C), np.int64), np.empty((B, T), np.bool_)
-    given = (x.detach().contiguous().numpy() for x in (start, force, corners, mass, numbers, gravity))
-    _roll(
-        contacts_address(), solver_address(), dt, newton, gyroscopic, rest, impact_speed, *given, states, modes, solved
-    )
-    return torch.from_numpy(states), torch.from_numpy(modes), torch.from_numpy(solved)
+    kept = B if keep else 0
+    rolled = Rolled(
+        np.empty((B, T + 1, 13)), np.empty((B, T, C), np.int64), np.empty((B, T), np.bool_), np.empty((kept, T, C)),
+        np.empty((kept, T, C, 2)), np.empty((kept, T, C), np.bool_),
+    )  # fmt: skip
+    _roll(contacts_address(), solver_address(), *options, start, force, corners, mass, numbers, gravity, *rolled)
+    return rolled

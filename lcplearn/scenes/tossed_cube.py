@@ -108,9 +108,9 @@ class TossedCube:
         """Advance a state by one step; the mode is that of each corner."""
         return self.body.advance(state, drive)
 
-    def rollout(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Trajectory:
-        """As `SpatialBody.rollout`."""
-        return self.body.rollout(state, drive)
+    def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
+        """As `SpatialBody.fused_rollout`."""
+        return self.body.fused_rollout(state, drive)
 
     def violation(
         self, before: Float[Tensor, "*batch 13"], drive: Drive, after: Float[Tensor, "*batch 13"]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lcplearn.scenes import SlidingBlock
-from lcplearn.scenes.scene import Drive, Mode, rollout
+from lcplearn.scenes.scene import Drive, Mode, Trajectory, rollout
 from lcplearn.scenes.space import POSE, quaternion_product, rotation_matrix
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
@@ -192,18 +192,40 @@ def test_a_state_of_nan_is_not_solved_and_harms_no_neighbour():
 
 
 @pytest.mark.parametrize("law", ["newton", "continuous"])
-def test_the_compiled_rollout_is_that_of_torch(law):
+@pytest.mark.parametrize("inertia", [0.001, (0.0011, 0.001, 0.0008)], ids=["one_inertia", "three"])
+def test_the_compiled_rollout_and_its_gradient_are_those_of_torch(law, inertia, monkeypatch):
     pytest.importorskip("numba")
-    other = {"mu_impact": 0.2, "restitution": 0.3, "radius": 0.005, "restitution_law": law, "compliance": 1e-3}
-    state, push = tossed(12, seed=5), 0.1 * torch.randn(12, 15, 6, generator=torch.Generator().manual_seed(6))
-    for scene in (body(**other), body(**other, inertia=0.001)):
-        compiled = scene.rollout(state, Drive(push))
-        state.requires_grad_()  # which torch alone can do
-        path = scene.rollout(state, Drive(push))
-        state.requires_grad_(False)
-        assert path.positions.requires_grad
-        assert not compiled.positions.requires_grad
-        torch.testing.assert_close(compiled.positions, path.positions.detach(), rtol=0, atol=1e-11)
-        torch.testing.assert_close(compiled.velocities, path.velocities.detach(), rtol=0, atol=1e-10)
-        assert (compiled.mode == path.mode).all()
-        assert (compiled.solved == path.solved).all()
+    random = torch.Generator().manual_seed(6)
+    count, steps = 40, 12
+    push = 0.1 * torch.randn(count, steps, 6, generator=random)
+    weights = torch.randn(count, steps, 13, generator=random)
+    numbers = {"mu": 0.4, "mu_impact": 0.2, "restitution": 0.3, "radius": 0.005, "ground": 0.002, "mass": 0.4}
+    numbers |= {"compliance": 1e-3, "corners": CORNERS, "gravity": torch.tensor([0.3, 0.0, -9.81])}
+    moments = inertia if isinstance(inertia, tuple) else (inertia,)
+    numbers |= {f"inertia_{k}": moment for k, moment in enumerate(moments)}
+
+    def outcome() -> tuple[Trajectory, list[Tensor]]:
+        values = {name: torch.as_tensor(x).expand(count, *torch.as_tensor(x).shape) for name, x in numbers.items()}
+        inputs = [x.clone().requires_grad_() for x in (tossed(count, seed=5), push, *values.values())]
+        given = dict(zip(values, inputs[2:], strict=True))
+        own = tuple(given.pop(f"inertia_{k}") for k in range(len(moments)))
+        scene = body(**given, inertia=own if len(own) > 1 else own[0], restitution_law=law)
+        path = scene.rollout(inputs[0], Drive(inputs[1]))
+        loss = (weights * torch.cat((path.positions, path.velocities), dim=-1)[:, 1:]).sum()
+        return path, list(torch.autograd.grad(loss, inputs))
+
+    path, gradients = outcome()
+    with torch.no_grad():
+        without = body(**{k: v for k, v in numbers.items() if "inertia" not in k}, inertia=inertia, restitution_law=law)
+        assert torch.equal(without.rollout(tossed(count, seed=5), Drive(push)).positions, path.positions)
+    monkeypatch.setattr("lcplearn.scenes.spatial_body.compiled_contacts", lambda device: None)
+    reference, expected = outcome()
+    torch.testing.assert_close(path.positions, reference.positions, rtol=0, atol=1e-10)
+    torch.testing.assert_close(path.velocities, reference.velocities, rtol=0, atol=1e-9)
+    assert (path.mode == reference.mode).all()
+    assert (path.solved == reference.solved).all()
+    for found, wanted in zip(gradients, expected, strict=True):
+        found, wanted = found.reshape(count, -1), wanted.reshape(count, -1)
+        assert (wanted != 0.0).any()
+        scale = wanted.abs().amax(-1) + wanted.abs().amax() * 1e-6
+        assert ((found - wanted).abs().amax(-1) / scale).amax() < 1e-5
