@@ -284,10 +284,12 @@ def _at_rest(problem: Problem, found: Answer) -> Tensor:
     """Where contacts leave no velocity but 0: the rows that hold it have full rank.
 
     A loaded contact that sticks holds all its directions, one that only touches (redundant corners) holds its normal.
+    Where contacts are compliant a normal speed within what the whole load would let a contact sink counts as none: else
+    the load would go on moving from corner to corner.
     """
     nv, directions = problem.free.shape[-1], problem.directions
     normal_speed = (problem.normal @ found.velocity.unsqueeze(-1)).squeeze(-1)
-    limit = DEAD_ZONE * problem.speed_scale()
+    limit = DEAD_ZONE * problem.speed_scale() + problem.compliance * found.normal.sum(-1, keepdim=True)
     touches = (normal_speed.abs() <= limit) & (problem.excess(found.velocity) <= limit)
     holds = touches & (found.normal > 0.0) & found.sticks
     result = found.solved & found.settled & (touches.sum(-1) + directions * holds.sum(-1) >= nv)

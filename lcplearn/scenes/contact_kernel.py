@@ -306,17 +306,19 @@ def _solve_plane(address, K, nv, T, rows, target, mu, compliance, free, mass, nu
 
 
 @compiled
-def _rests(C, nv, T, target, normal, tangents, mass, scale, v, load, sticks, gram):
+def _rests(C, nv, T, target, normal, tangents, compliance, mass, scale, v, load, sticks, gram):
     """As `contact._at_rest`."""
     if T == 0:
         return False
     gram[:, :] = 0.0
-    held = 0
+    held, whole_load = 0, 0.0
+    for i in range(C):
+        whole_load += load[i]
     for i in range(C):
         speed = 0.0
         for k in range(nv):
             speed += normal[i, k] * v[k]
-        limit = DEAD_ZONE * scale[i]
+        limit = DEAD_ZONE * scale[i] + compliance[i] * whole_load
         if not (abs(speed) <= limit and speed - target[i] <= limit):
             continue
         kept = 1 + (T if load[i] > 0.0 and sticks[i] else 0)
@@ -417,7 +419,10 @@ def _solve_element(
                 added += 1
     solved = solved and finite
     at_rest = (
-        rest and solved and settled and _rests(C, nv, T, target, normal, tangents, mass, scale, v, load, sticks, gram)
+        rest
+        and solved
+        and settled
+        and _rests(C, nv, T, target, normal, tangents, compliance, mass, scale, v, load, sticks, gram)
     )
     return solved, settled, at_rest
 

@@ -27,7 +27,10 @@ def test_what_the_needed_rows_give_solves_the_law_of_all_contacts(seed):
         assert right.double().mean() >= 0.95
         # the iteration leaves 1e-10 of the free velocity; what has one LCP leaves rounding
         directions = scene[0].tangents.shape[-2]
-        assert violation(*scene, step)[right].amax() < (1e-12 if directions == 1 else 1e-8)
+        tolerance = 1e-12 if directions == 1 else 1e-8
+        # what is written as at rest may have been computed to sink by what its compliance allows
+        sinking = (scene[0].compliance.amax(-1) * step.normal_impulse.sum(-1)) * step.at_rest
+        assert (violation(*scene, step) - tolerance - 2.0 * sinking)[right].amax() < 0.0
 
 
 def enumerated(contacts: Contacts, free: Tensor, mass: Tensor) -> Tensor:

@@ -62,3 +62,10 @@ def test_the_gradient_at_fixed_impulses_is_that_of_the_minimum():
         up, down = (float(violation(states, **{name: value + step}).sum()) for step in (h, -h))
         difference = (up - down) / (2 * h)
         assert abs(float(gradient) - difference) < 1e-3 * abs(difference)
+
+
+def test_a_compliant_cube_does_not_creep_before_it_rests():
+    path = rollout(TossedCube(**NUMBERS, mu_impact=0.15, restitution=0.3, radius=0.1 * H), start(), forces(160))
+    speed = path.velocities.norm(dim=-1)
+    assert bool((speed[:, -1] == 0.0).all())
+    assert int(((speed > 0.0) & (speed < 1e-4)).sum(-1).max()) <= 2
