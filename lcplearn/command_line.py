@@ -46,7 +46,7 @@ def prepare(arguments: Sequence[str], conf: Path) -> Command:
         SettingsError: a mistake that a check without torch can find, or a folder that can't be made.
         HydraException, OmegaConfBaseException: a mistake that Hydra finds.
     """
-    arguments = [_quote_path(argument) for argument in arguments]
+    arguments = [_quote_path(argument) for argument in _search(arguments)]
     options = [argument for argument in arguments if argument.startswith("-")]
     if any(option not in SWEEP for option in options):  # --cfg and the like, or Lightning's further processes
         return Command(arguments)
@@ -161,6 +161,19 @@ def _new(folder: Path, key: str) -> Path:
         else:
             return chosen
     raise AssertionError
+
+
+def _search(arguments: Sequence[str]) -> list[str]:
+    """Hydra's --config-dir FOLDER as the setting that it stands for, so that what is below it is checked early too."""
+    text = "\n".join(arguments)
+    match = re.search(r"^(?:--config-dir|-cd)[=\n](.+)$", text, re.MULTILINE)
+    if match is None:
+        return [*arguments]
+    folder = Path(match[1])
+    if not folder.is_dir():
+        raise SettingsError(f"--config-dir {folder} is not a folder.")
+    rest = text[: match.start()] + text[match.end() :]
+    return [*filter(None, rest.split("\n")), f"hydra.searchpath=['file://{folder.resolve()}']"]
 
 
 def _quote_path(argument: str) -> str:

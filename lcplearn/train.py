@@ -5,6 +5,7 @@ conf/train.yaml says what can be set. HYDRA_FULL_ERROR=1 shows the whole traceba
 
 import math
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -87,10 +88,11 @@ def train(config: DictConfig) -> float:
         print(error)  # a sweep goes on
         return math.inf
     except TrainingInterrupted as stop:
-        overrides = [override for override in run.overrides.task if not override.startswith("ckpt_path=")]
+        searched = [override for override in run.overrides.hydra if override.startswith("hydra.searchpath=")]
+        overrides = searched + [override for override in run.overrides.task if not override.startswith("ckpt_path=")]
         name = "lcplearn train" if Path(sys.argv[0]) == HERE else "python train.py"
-        command = " ".join([name, *overrides, f"ckpt_path={os.path.relpath(stop.checkpoint)}"])
-        raise KeyboardInterrupt(f"Stopped; to go on: {command}") from None
+        arguments = shlex.join([*overrides, f"ckpt_path={os.path.relpath(stop.checkpoint)}"])
+        raise KeyboardInterrupt(f"Stopped; to go on: {name} {arguments}") from None
     if result.metrics is not None:
         learned = ", ".join(f"{name} = {value:.6g}" for name, value in result.model.physical_parameters().items())
         print(f"\n{format_table(result.metrics)}" + (f"\n\nlearned: {learned}" if learned else ""))

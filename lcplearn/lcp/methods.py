@@ -41,7 +41,11 @@ TORCH_METHODS = {
     "interior_point": TorchMethod(interior_point, smooths=True),
     "diagonal": TorchMethod(diagonal, general=False),
 }
-METHODS = ("auto", "pivoting", *TORCH_METHODS)
+
+
+def method_names() -> tuple[str, ...]:
+    """What `solve_lcp` takes for its method; a name that joins TORCH_METHODS is among them."""
+    return ("auto", "pivoting", *TORCH_METHODS)
 
 
 class Options(NamedTuple):

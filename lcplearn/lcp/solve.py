@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lcplearn.lcp.compiled import traced_solve
 from lcplearn.lcp.gradient import differentiable_solve
-from lcplearn.lcp.methods import METHODS, TORCH_METHODS, Options
+from lcplearn.lcp.methods import TORCH_METHODS, Options, method_names
 from lcplearn.lcp.residuals import default_tolerance
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.torch_internals import traced
@@ -99,8 +99,8 @@ def solve_lcp(
 
 def check_options(method: str, tol: float | None, max_iter: int | None, smoothing: float) -> None:
     """Raise ValueError for options that no problem could use."""
-    if method not in METHODS:
-        raise ValueError(f"method: expected one of {', '.join(METHODS)}; got {method!r}")
+    if method not in method_names():
+        raise ValueError(f"method: expected one of {', '.join(method_names())}; got {method!r}")
     if tol is not None and not (_is_number(tol) and 0 < tol < math.inf):
         raise ValueError(f"tol: expected a positive finite number, or None; got {tol!r}")
     if max_iter is not None and not (type(max_iter) is int and 0 < max_iter < 2**63):

@@ -96,11 +96,12 @@ def fit_pushes(
     pictures = draw(model, judged, prediction)
     for name, figure in pictures.items():
         figure.savefig(folder / f"{name}.png", dpi=120)
-    if isinstance(logger, TensorBoardLogger):
+    if logger:
         logger.log_metrics({f"test/{name}": float(value) for name, value in metrics.items()})
-        for name, figure in pictures.items():
-            logger.experiment.add_figure(name, figure)
-        logger.experiment.flush()
+        if isinstance(logger, TensorBoardLogger):
+            for name, figure in pictures.items():
+                logger.experiment.add_figure(name, figure)
+        logger.finalize("success")
     return PushResult(model, metrics, report, folder)
 
 

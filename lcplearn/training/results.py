@@ -59,6 +59,7 @@ def _log(
     if not isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_hyperparams(dict(used))
         trainer.logger.log_metrics({f"test/{key}": value for key, value in finite.items()})
+        trainer.logger.save()
         return
     main = {f"test/{key}": finite[key] for key in MAIN if key in finite}
     trainer.logger.log_hyperparams(dict(used), main)

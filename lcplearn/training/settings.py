@@ -60,7 +60,8 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
     if settings["batch_size"] is not None and settings["optimizer"].get("lbfgs_after") is not None:
         raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
     _check_ranges(settings)
-    _check_loss(settings["loss"], _vocabulary(conf, "loss")[0])
+    own = not str(settings["model"].get("_target_")).startswith("lcplearn.")  # and may have loss terms of its own
+    _check_loss(settings["loss"], settings["loss"] if own else _vocabulary(conf, "loss")[0])
     length, horizon = settings["data"].get("length"), settings["loss"].get("horizon", 1)
     if length is not None and horizon > length:
         raise SettingsError(f"loss.horizon={horizon} is longer than the recordings: data.length={length}.")

@@ -2,11 +2,17 @@
 
 import importlib.util
 import json
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from real_data import real_data
+
+from lcplearn.command_line import prepare
+from lcplearn.lcp import methods, solve
+from lcplearn.train import CONF
+from lcplearn.training.settings import SettingsError
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -18,6 +24,13 @@ def example(name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def extending(monkeypatch):
+    """examples/ as the folder where somebody works."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.chdir(EXAMPLES)
 
 
 def test_each_example_has_a_test_here():
@@ -70,3 +83,44 @@ def test_notebook(tmp_path, monkeypatch):
     for number, cell in enumerate(notebook["cells"]):
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), f"first_steps.ipynb, cell {number}", "exec"), scope)
+
+
+@pytest.mark.usefixtures("extending")
+def test_a_scene_of_ones_own():
+    assert import_module("extending.scene").main() == 0
+
+
+@pytest.mark.usefixtures("extending")
+def test_a_data_set_of_ones_own():
+    assert import_module("extending.data_set").main() == 10
+
+
+@pytest.mark.usefixtures("extending")
+def test_a_formulation_of_ones_own():
+    assert import_module("extending.formulation").main(epochs=30) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.usefixtures("extending")
+def test_a_loss_of_ones_own():
+    off = import_module("extending.loss").main()
+    assert off["huber"] < 0.5 * off["prediction"]
+
+
+@pytest.mark.usefixtures("extending")
+def test_a_solver_method_of_ones_own(monkeypatch):
+    monkeypatch.setattr(methods, "TORCH_METHODS", dict(methods.TORCH_METHODS))
+    monkeypatch.setattr(solve, "TORCH_METHODS", methods.TORCH_METHODS)
+    symmetric, others = import_module("extending.solver_method").main()
+    assert symmetric == 1
+    assert others < 1
+
+
+@pytest.mark.usefixtures("extending")
+def test_own_configuration_is_found_and_checked(tmp_path):
+    own = ["--config-dir", "extending/conf", "data=ramp", "model=clipped", "loss=huber", f"hydra.run.dir={tmp_path}"]
+    arguments = prepare(own, CONF).arguments
+    assert arguments[-1] == f"hydra.searchpath=['file://{EXAMPLES}/extending/conf']"
+    with pytest.raises(SettingsError, match=r"Unknown setting 'data.outlier'; did you mean 'data.outliers'"):
+        prepare([*own, "+data.outlier=1"], CONF)
+    with pytest.raises(SettingsError, match=r"--config-dir nowhere is not a folder"):
+        prepare(["--config-dir=nowhere"], CONF)

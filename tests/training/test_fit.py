@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from lightning.pytorch import Callback
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training.helpers import QUIET, short_fit, small_data, tiny_data
 from training.kill import kill_once
@@ -199,6 +199,15 @@ def test_annealing_leaves_the_plateau_where_no_sample_slips(tmp_path: Path) -> N
         errors[epochs] = abs(model.physical_parameters()["mu"] - 0.4)
     assert errors[0] == pytest.approx(4.6)
     assert errors[100] < 1e-6
+
+
+def test_a_logger_of_another_kind_gets_the_figures_of_training_and_of_the_test(tmp_path: Path) -> None:
+    data = tiny_data()
+    logger = CSVLogger(tmp_path, name="", version="csv")
+    short_fit(Physical(dt=data.dt), data, tmp_path / "run", logger=logger)
+    header, *rows = (tmp_path / "csv" / "metrics.csv").read_text().splitlines()
+    assert {"train/total", "val/loss", "parameters/mu", "test/velocity_rmse"} <= set(header.split(","))
+    assert float(rows[-1].split(",")[header.split(",").index("test/velocity_rmse")]) > 0
 
 
 def test_tensorboard_shows_losses_modes_residuals_parameters_figures_and_the_table(tmp_path: Path) -> None:

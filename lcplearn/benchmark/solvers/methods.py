@@ -16,7 +16,7 @@ from lcplearn.lcp.solve import solve_lcp
 # The interior point ends on a basis, to rounding; stopped at a coarser tolerance it is the smoothed solution of
 # that complementarity.
 METHODS: dict[str, dict[str, Any]] = {
-    **{name: {"method": name} for name in lcp_methods.METHODS if name != "auto"},
+    **{name: {"method": name} for name in lcp_methods.method_names() if name != "auto"},
     "smoothed 1e-10": {"smoothing": 1e-10},
     "smoothed 1e-7": {"smoothing": 1e-7},
     "smoothed 1e-4": {"smoothing": 1e-4},
