@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 def lcplearn(folder: Path, *arguments: str, package: Path = ROOT) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "lcplearn", *arguments]
     environment = {"PYTHONPATH": str(package), "PATH": ""}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
 
 
 def test_each_command_is_there_and_help_names_it(tmp_path):

@@ -86,7 +86,8 @@ def test_a_line_of_friction_problems_stays_solvable():
     assert solve_lcp(*map(torch.from_numpy, moved)).solved.all()
 
 
-def test_each_applicable_method_has_a_row_and_residuals_are_of_its_precision():
+def test_each_applicable_method_has_a_row_and_residuals_are_of_its_precision(monkeypatch):
+    monkeypatch.setattr(solvers, "LONGEST_QUICK", 60.0)  # a busy machine leaves no method out
     data = problems.sliding_block_direct(np.random.default_rng(0), 12)
     for dtype, limit in ((torch.float64, 1e-14), (torch.float32, 2e-6)):
         rows = {row["method"]: row for row in measure(FAMILIES[0], data, dtype, Options(None, quick=True))}

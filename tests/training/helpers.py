@@ -39,4 +39,4 @@ def train(
 ) -> subprocess.CompletedProcess[str]:
     """Run train.py in a folder, by itself or by a launcher, with more environment variables."""
     command = [sys.executable, *launcher, str(ROOT / "train.py"), *overrides]
-    return subprocess.run(command, cwd=folder, env=environment(**more), capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=folder, env=environment(**more), capture_output=True, text=True, timeout=300)

@@ -78,7 +78,7 @@ def test_ctrl_c_ends_runs_side_by_side_without_a_traceback(tmp_path: Path) -> No
     while "#1 : seed=1" not in (line := process.stdout.readline()):
         assert line, "ended before it launched its runs"
     process.send_signal(signal.SIGINT)
-    errors = process.communicate(timeout=60)[1]
+    errors = process.communicate(timeout=300)[1]
     assert process.returncode == 1
     assert "Stopped." in errors.splitlines()
     assert "Traceback" not in errors

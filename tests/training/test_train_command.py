@@ -22,7 +22,7 @@ def test_a_mistyped_setting_ends_in_one_sentence_without_torch(tmp_path: Path) -
     code = "import runpy, sys; sys.argv = ['train.py', 'modle=relu']\ntry: runpy.run_path(%r, run_name='__main__')\n"
     code += "finally: print('torch' in sys.modules)"
     command = [sys.executable, "-c", code % str(ROOT / "train.py")]
-    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
     assert done.stderr.strip() == "Unknown setting 'modle'; did you mean 'model'?"
     assert done.stdout.strip() == "False"
@@ -58,7 +58,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_the_command_that_goes_on(tmp_path: Path)
     while "val/rollout_rmse" not in process.stderr.read(80):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    errors = process.communicate(timeout=60)[1]
+    errors = process.communicate(timeout=300)[1]
     assert process.returncode == 1
     hint = re.search(r"Stopped; to go on: python train.py (.* ckpt_path=\S+last.ckpt)", errors)
     assert hint is not None, errors
