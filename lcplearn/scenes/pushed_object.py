@@ -10,11 +10,9 @@ from torch import Tensor
 
 import lcplearn
 from lcplearn.scenes.pushes import Push
-from lcplearn.scenes.pushing_lcp import Bearing, Touch, aligned_lcp, ellipsoid_lcp, polygon_lcp
-from lcplearn.scenes.scene import Mode
+from lcplearn.scenes.pushing_lcp import Bearing, Touch, ellipsoid_lcp, polygon_lcp
+from lcplearn.scenes.pushing_step import Moved, compiled_pushing, finger_mode, put, settle, take
 
-SETTLED = 1e-9  # change of a support's velocity between two iterates, in units of the finger's
-DAMP_FROM = 4  # iterations; undamped, one in a hundred cycles
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -60,17 +58,6 @@ class PushPath(NamedTuple):
     finger: Float[Tensor, "b S+1 2"]
     solved: Bool[Tensor, "b S"]
     settled: Bool[Tensor, "b S"]
-
-
-class _Moved(NamedTuple):
-    """A step, free of units: twist and force in the object's axes, velocity of the supports."""
-
-    twist: Float[Tensor, "b 3"]
-    force: Float[Tensor, "b 2"]
-    mode: Int[Tensor, " b"]
-    slip: Float[Tensor, "b k 2"]
-    solved: Bool[Tensor, " b"]
-    settled: Bool[Tensor, " b"]
 
 
 @dataclass(frozen=True)
@@ -123,32 +110,66 @@ class PushedObject:
 
     def rollout(self, push: Push, grip: Grip) -> PushPath:
         """Push, in `steps` equal steps of the finger from the first touch to the end of its path."""
-        centre, angle = (push.pose[:, :2] + rotate(push.pose[:, 2], self.com)) / self.radius, push.pose[:, 2]
-        start = push.start + self.first_touch(push)[:, None] * (push.end - push.start)
-        finger = (start if grip.shift is None else start + grip.shift) / self.radius
-        stride = (push.end - start) / (self.radius * self.steps)
-        length = stride.norm(dim=-1).clamp_min(1e-9)  # a finger that never touches does not step
+        wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in (*push, *grip))
+        if wanted or self.law != "cone" or compiled_pushing(push.pose) is None:
+            return self._rollout_stepwise(push, grip)
+        path = self._rollout_compiled(push, grip)
+        rest = (~(path.solved & path.settled).all(-1)).nonzero()[:, 0]
+        return put(path, rest, self._rollout_stepwise(take(push, rest), take(grip, rest))) if len(rest) else path
+
+    def _rollout_stepwise(self, push: Push, grip: Grip) -> PushPath:
+        centre, angle, finger, stride, length = self._start(push, grip)
+        bearing = self._bearing(grip)
         slip: Tensor | None = None
-        poses, forces, modes, fingers = [self._pose(centre, angle)], [], [], [finger * self.radius]
+        poses, forces, modes = [self._pose(centre, angle)], [], []
         solved, settled = [], []
         for step in range(self.steps):
             moved = rotate(-angle, stride)
-            touch = self._touch(rotate(-angle, finger - centre), moved, length, grip.finger_mu)
-            bearing = self._bearing(grip)
+            touch = self._touch(rotate(-angle, finger + step * stride - centre), moved, length, grip.finger_mu)
             if slip is None:  # every support follows the finger, turning a little
                 slip = (moved / length[:, None])[:, None] + 1e-3 * bearing.points
             twist, force, mode, slip, good, calm = self._move(bearing, touch, slip.detach(), step)
             twist = twist * length[:, None]
-            forces.append(rotate(angle, force) * (grip.mu * self.mass * self.gravity)[:, None])
+            forces.append(rotate(angle, force))
             centre = centre + rotate(angle + twist[:, 2] / 2.0, twist[:, :2])
-            angle, finger = angle + twist[:, 2], finger + stride
+            angle = angle + twist[:, 2]
             poses.append(self._pose(centre, angle))
-            fingers.append(finger * self.radius)
             modes.append(mode)
             solved.append(good)
             settled.append(calm)
-        stacks = (torch.stack(parts, 1) for parts in (poses, forces, modes, fingers, solved, settled))
-        return PushPath(*stacks)
+        told = (torch.stack(parts, 1) for parts in (modes, solved, settled))
+        return self._path(torch.stack(poses, 1), torch.stack(forces, 1), finger, stride, grip, *told)
+
+    @torch.no_grad()
+    def _rollout_compiled(self, push: Push, grip: Grip) -> PushPath:
+        from lcplearn.scenes.pushing_rollout import roll
+
+        centre, angle, finger, stride, length = self._start(push, grip)
+        outline = ((self.vertices - self.com) / self.radius, *self.edges())
+        track, forces, (solved, settled, mode) = roll(
+            outline, self._bearing(grip), torch.cat((centre, angle[:, None]), -1), finger, stride, length,
+            grip.finger_mu, steps=self.steps, creep=self.creep, iterations=self.iterations,
+        )  # fmt: skip
+        return self._path(
+            self._pose(track[..., :2], track[..., 2]), forces, finger, stride, grip, mode, solved, settled
+        )
+
+    def _start(self, push: Push, grip: Grip) -> tuple[Tensor, ...]:
+        """Centre of mass, angle, finger at the first touch, its step and the length of that; in units of the radius."""
+        centre, angle = (push.pose[:, :2] + rotate(push.pose[:, 2], self.com)) / self.radius, push.pose[:, 2]
+        start = push.start + self.first_touch(push)[:, None] * (push.end - push.start)
+        finger = (start if grip.shift is None else start + grip.shift) / self.radius
+        stride = (push.end - start) / (self.radius * self.steps)
+        return centre, angle, finger, stride, stride.norm(dim=-1).clamp_min(1e-9)  # a finger that never touches rests
+
+    def _path(
+        self, poses: Tensor, forces: Tensor, finger: Tensor, stride: Tensor, grip: Grip, mode: Tensor, solved: Tensor,
+        settled: Tensor,
+    ) -> PushPath:  # fmt: skip
+        newton = (grip.mu * self.mass * self.gravity)[:, None, None]
+        count = torch.arange(self.steps + 1, dtype=finger.dtype)[:, None]
+        fingers = (finger[:, None] + count * stride[:, None]) * self.radius
+        return PushPath(poses, forces * newton, mode, fingers, solved, settled)
 
     def first_touch(self, push: Push) -> Float[Tensor, " b"]:
         """Fraction of the finger's way at which it touches the object; 1 where it never does."""
@@ -203,39 +224,10 @@ class PushedObject:
             grip.wrench,
         )
 
-    def _settle(self, bearing: Bearing, touch: Touch, slip: Tensor) -> "_Moved":
-        """One step by the exact cone: iterate without gradient, differentiate the last LCP."""
-        load = bearing.loads.detach()
-        before = torch.full_like(load[:, 0], torch.inf)
-        active = torch.arange(len(load))
-        with torch.no_grad():
-            for iteration in range(self.iterations - 1):
-                part, contact = _take(bearing, active), _take(touch, active)
-                problem = aligned_lcp(part, contact, slip[active], load[active], creep=self.creep)
-                z = lcplearn.solve_lcp(problem.M, problem.q).z
-                new = _velocities(part.points, problem.twist(z))
-                change = (new - slip[active]).norm(dim=-1).amax(-1)
-                if iteration >= DAMP_FROM:
-                    slow = (change > 0.3 * before[active]) & (change > SETTLED)
-                    new = torch.where(slow[:, None, None], (slip[active] + new) / 2.0, new)
-                slip, load, before = slip.clone(), load.clone(), before.clone()
-                slip[active], before[active] = new, change
-                load[active] = part.loads + (part.transfer @ problem.force(z, self.creep)[..., None])[..., 0]
-                active = active[~(change < SETTLED)]  # each element stops by itself: none depends on its batch
-                if len(active) == 0:
-                    break
-        problem = aligned_lcp(bearing, touch, slip, load, creep=self.creep)
-        solution = lcplearn.solve_lcp(problem.M, problem.q)
-        twist = problem.twist(solution.z)
-        new = _velocities(bearing.points, twist.detach())
-        settled = (new - slip).norm(dim=-1).amax(-1) < 10.0 * SETTLED
-        force = problem.force(solution.z, self.creep)
-        return _Moved(twist, force, _mode(solution.z), new, solution.solved, settled)
-
-    def _move(self, bearing: Bearing, touch: Touch, slip: Tensor, step: int) -> "_Moved":
+    def _move(self, bearing: Bearing, touch: Touch, slip: Tensor, step: int) -> Moved:
         """One step by the friction law in use."""
         if self.law == "cone":
-            return self._settle(bearing, touch, slip)
+            return settle(bearing, touch, slip, creep=self.creep, iterations=self.iterations)
         if self.law == "ellipsoid":
             arm = (bearing.loads * bearing.points.norm(dim=-1)).sum(-1)
             problem = ellipsoid_lcp(touch, arm)
@@ -251,10 +243,10 @@ class PushedObject:
             size = torch.cat((force, (torque / arm)[:, None]), -1).norm(dim=-1, keepdim=True)
             force = force / torch.where(size > 0, size, 1.0)
         calm = torch.ones_like(solution.solved)
-        return _Moved(problem.twist(solution.z), force, _mode(solution.z), slip, solution.solved, calm)
+        return Moved(problem.twist(solution.z), force, finger_mode(solution.z), slip, solution.solved, calm)
 
     def _pose(self, centre: Tensor, angle: Tensor) -> Tensor:
-        return torch.cat((centre * self.radius - rotate(angle, self.com), angle[:, None]), -1)
+        return torch.cat((centre * self.radius - rotate(angle, self.com), angle[..., None]), -1)
 
 
 def plane_fit(
@@ -282,20 +274,3 @@ def rotate(angle: Float[Tensor, "*#b"], vectors: Float[Tensor, "*#b 2"]) -> Floa
     c, s = angle.cos(), angle.sin()
     x, y = vectors[..., 0], vectors[..., 1]
     return torch.stack((c * x - s * y, s * x + c * y), -1)
-
-
-def _velocities(points: Tensor, twist: Tensor) -> Tensor:
-    turned = torch.stack((-points[..., 1], points[..., 0]), -1)
-    return twist[:, None, :2] + twist[:, 2, None, None] * turned
-
-
-def _mode(z: Tensor) -> Tensor:
-    """Sliding speed and the two multipliers that are zero when the finger slides tell what it does."""
-    normal, sum_, speed = z[:, -3], z[:, -2], z[:, -1]
-    slides = (speed > 0) | (sum_ <= 0)
-    mode = torch.where(slides, int(Mode.SLIP), int(Mode.STICK))
-    return torch.where(normal <= 0, int(Mode.SEPARATION), mode)
-
-
-def _take(parts, index):  # type: ignore[no-untyped-def]
-    return type(parts)(*(None if part is None else part[index] for part in parts))

@@ -16,6 +16,7 @@ from lcplearn.training.checkpoint import load
 
 F = torch.float64
 CHECKPOINTS = Path(__file__).parents[2] / "data" / "checkpoints"
+COARSE = {"steps": 5}  # the pushes of `known` are made by the same steps
 
 
 def thing(data: PushData) -> dict:
@@ -32,7 +33,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def known(data):
     """Pushes of an object whose numbers are known, predicted by the mechanics themselves."""
-    model = Supports(**thing(data), surfaces=["board", "wood"])
+    model = Supports(**thing(data), **COARSE, surfaces=["board", "wood"])
     with torch.no_grad():
         model.numbers.copy_(torch.tensor((math.log(0.5), 1.2, 0.8)))
         model.mu.copy_(torch.tensor((0.25, 0.4)))
@@ -46,10 +47,18 @@ def run(model, pushes, outcome):
     return model
 
 
+@pytest.fixture(scope="module")
+def fitted(data, known):
+    """One model of each kind, fitted to the known pushes."""
+    _, outcome = known
+    coarse = {Supports: COARSE, Residual: COARSE | {"learning_steps": 10}, Ridge: {}, PushMLP: {"rounds": 40}}
+    return {kind: run(kind(**thing(data), **own), data.pushes, outcome) for kind, own in coarse.items()}
+
+
 def test_supports_find_the_numbers_that_made_the_pushes(data, known):
     """mu_c, height and rim from end poses; mu of each surface from forces."""
     true, outcome = known
-    found = run(Supports(**thing(data)), data.pushes, outcome).physical_parameters()
+    found = run(Supports(**thing(data), **COARSE), data.pushes, outcome).physical_parameters()
     for name, value in true.physical_parameters().items():
         assert found[name] == pytest.approx(value, rel=0.02), name
 
@@ -58,7 +67,8 @@ def test_mu_comes_from_the_force_alone(data, known):
     _, outcome = known
     doubled = outcome._replace(force=2.0 * outcome.force)
     one, two = (
-        run(Supports(**thing(data), height=False), data.pushes, o).physical_parameters() for o in (outcome, doubled)
+        run(Supports(**thing(data), **COARSE, height=False), data.pushes, o).physical_parameters()
+        for o in (outcome, doubled)
     )
     assert two["mu_board"] == pytest.approx(2.0 * one["mu_board"])
     assert two["mu_c"] == pytest.approx(one["mu_c"])
@@ -70,7 +80,7 @@ def test_the_residual_learns_what_the_mechanics_miss(data, known):
     moved = true.motion(data.pushes, outcome.pose)
     moved[:, 2] += torch.where(data.pushes.whole_face, 0.0015, -0.001)
     outcome = outcome._replace(pose=true.pose(data.pushes, moved))
-    model = run(Residual(**thing(data)), data.pushes, outcome)
+    model = run(Residual(**thing(data), **COARSE), data.pushes, outcome)
     with torch.no_grad():
         after = (model.motion(data.pushes, model.predict(data.pushes).pose) - moved).norm(dim=-1).mean()
         before = (model.motion(data.pushes, model.base.predict(data.pushes).pose) - moved).norm(dim=-1).mean()
@@ -78,9 +88,8 @@ def test_the_residual_learns_what_the_mechanics_miss(data, known):
 
 
 @pytest.mark.parametrize("kind", [Supports, Residual, Ridge, PushMLP])
-def test_a_model_from_its_state_predicts_the_same(data, known, kind):
-    _, outcome = known
-    model = run(kind(**thing(data)), data.pushes, outcome)
+def test_a_model_from_its_state_predicts_the_same(data, fitted, kind):
+    model = fitted[kind]
     again = kind(**model.arguments)
     again.load_state_dict(copy.deepcopy(model.state_dict()))
     with torch.no_grad():
@@ -88,9 +97,8 @@ def test_a_model_from_its_state_predicts_the_same(data, known, kind):
 
 
 @pytest.mark.parametrize("kind", [Residual, Ridge])
-def test_a_prediction_does_not_depend_on_the_other_pushes(data, known, kind):
-    _, outcome = known
-    model = run(kind(**thing(data)), data.pushes, outcome)
+def test_a_prediction_does_not_depend_on_the_other_pushes(data, fitted, kind):
+    model = fitted[kind]
     with torch.no_grad():
         together, alone = model.predict(data.pushes).pose, model.predict(data.pushes.take([7])).pose
     torch.testing.assert_close(alone[0], together[7], atol=1e-10, rtol=0)

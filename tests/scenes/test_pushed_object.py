@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from lcplearn.scenes import pushed_object, pushing_node, pushing_rollout, pushing_step
 from lcplearn.scenes.pushed_object import Grip, PushedObject, plane_fit, rotate
 from lcplearn.scenes.pushes import Push
 from lcplearn.scenes.scene import Mode
@@ -104,6 +105,59 @@ def test_a_batch_equals_its_elements_one_by_one():
             Push(*(p[k : k + 1] for p in push)), Grip(*(g if g is None else g[k : k + 1] for g in grip))
         )
         torch.testing.assert_close(alone.poses[0], together.poses[k], atol=1e-13, rtol=0)
+
+
+def test_the_compiled_step_is_the_lcp_solvers(monkeypatch):
+    """Poses, forces and gradients with respect to all that a push and a grip have."""
+    push, grip, thing = random_pushes(60), triangle_grip(60), triangle(steps=4)
+    grip = grip._replace(shift=torch.full((60, 2), 1e-4, dtype=F), wrench=torch.full((60, 3), 0.02, dtype=F))
+    inputs = [x.clone().requires_grad_() for x in (*push, *grip)]
+    weights = torch.tensor((3.0, -8.0, 0.5), dtype=F)
+
+    def found():
+        path = thing.rollout(Push(*inputs[:3]), Grip(*inputs[3:]))
+        assert (path.solved & path.settled).all()
+        total = (path.poses[:, -1] * weights).sum() + 0.01 * path.forces.sum()
+        return path, torch.autograd.grad(total, inputs)
+
+    with torch.no_grad():
+        rolled = thing.rollout(push, grip)
+    stepped, gradients = found()
+    for module in (pushing_step, pushed_object):
+        monkeypatch.setattr(module, "compiled_pushing", lambda x: None)
+    slow, true = found()
+    for path in (rolled, stepped):
+        for ours, theirs in zip(path, slow, strict=True):
+            torch.testing.assert_close(ours, theirs.detach(), atol=1e-10, rtol=1e-10, check_dtype=False)
+    for ours, theirs in zip(gradients, true, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-8, atol=1e-8 * float(theirs.abs().max()))
+
+
+def test_what_the_compiled_code_leaves_is_solved(monkeypatch):
+    """Every second push: its numbers are garbage then."""
+    push, grip, thing = random_pushes(20), triangle_grip(20), triangle(steps=3)
+    with torch.no_grad():
+        whole = thing.rollout(push, grip)
+    settle, roll = pushing_node._settle, pushing_rollout._roll
+
+    def settle_half(*arguments):
+        settle(*arguments)
+        out, flags = arguments[-2:]
+        flags[1::2, :2] = 0
+        for x in out:
+            x[1::2] = math.nan
+
+    def roll_half(*arguments):
+        roll(*arguments)
+        track, forces, flags = arguments[-1]
+        track[1::2, 2:], forces[1::2, 1:], flags[1::2, 1:] = math.nan, math.nan, 0
+
+    monkeypatch.setattr(pushing_rollout, "_roll", roll_half)
+    monkeypatch.setattr(pushing_node, "_settle", settle_half)
+    with torch.no_grad():
+        mended = thing.rollout(push, grip)
+    for ours, theirs in zip(mended, whole, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-10, rtol=1e-10)
 
 
 def test_the_world_may_be_turned():
