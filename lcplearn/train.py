@@ -119,7 +119,7 @@ def train_pushes(config: DictConfig, data: Any, settings: dict[str, Any], folder
 
 def sentence(error: BaseException) -> str:
     """What a user can do about an error, in one sentence."""
-    from lcplearn.training.settings import explain
+    from lcplearn.training.vocabulary import explain
 
     failed_call = isinstance(error, InstantiationException) and error.__cause__ is not None
     cause = error.__cause__ if failed_call else error

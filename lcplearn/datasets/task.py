@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lcplearn.datasets.files import positive_number, read_npz
+from lcplearn.datasets.files import number, positive_number, read_npz
 from lcplearn.datasets.recordings import Recordings
 from lcplearn.domains import positive
 from lcplearn.scenes.scene import Drive, Scene
@@ -154,7 +154,7 @@ def read_recordings(
         test=everything,
         test_long=everything,
         given={"gravity": 9.81} if given is None else given,
-        truth={name: positive_number(path, name, arrays[name]) for name in truth if name in arrays},
+        truth={name: number(path, name, arrays[name]) for name in truth if name in arrays},
     )
 
 

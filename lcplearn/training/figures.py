@@ -124,8 +124,7 @@ def error_over_horizon(found: Predictions) -> "Figure":
     """Root mean square and largest error of the velocity against the steps since the start of the rollout."""
     figure, axes = _figure(1, 1, (7.0, 4.0))
     recordings, path = found.long_recordings, found.long
-    predicted = torch.cat((path.positions, path.velocities), dim=-1)
-    error = found.model.velocity_error(predicted[:, 1:], recordings.truth[:, 1:]).sqrt()
+    error = found.model.velocity_error(path.states[:, 1:], recordings.truth[:, 1:]).sqrt()
     known = recordings.valid
     error = torch.where(known, error, 0.0)
     error = error.nan_to_num(nan=1e12).clamp(max=1e12)  # more is not drawn: it has diverged

@@ -37,8 +37,7 @@ def read_for(path: Path | str, model: Formulation) -> Tosses:
 @torch.no_grad()
 def rollout(model: Formulation, start: Float[Tensor, "B 13"], steps: int) -> Float[Tensor, "B rows 13"]:
     """States from a start, nothing but gravity and contact acting."""
-    path = model.rollout(start, start.new_zeros(len(start), steps, 6))
-    return torch.cat((path.positions, path.velocities), dim=-1)
+    return model.rollout(start, start.new_zeros(len(start), steps, 6)).states
 
 
 def predict_tosses(model: Formulation, tosses: Tosses) -> Float[Tensor, "N rows 13"]:
