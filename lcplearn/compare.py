@@ -10,13 +10,13 @@ import math
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 from hydra.experimental.callback import Callback
 
+from lcplearn import __version__
 from lcplearn.training.figures_of_merit import KEYS, figure, in_order
 from lcplearn.training.settings import flat
 
@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m lcplearn.compare", description=__doc__.split("\n\n")[0])
     parser.add_argument("runs", nargs="+", metavar="RUNS", help="run folders, or folders above them")
     parser.add_argument("--out", default=".", help="folder for compare.md and compare.png (default: here)")
-    parser.add_argument("--version", action="version", version=f"lcplearn {version('lcplearn')}")
+    parser.add_argument("--version", action="version", version=f"lcplearn {__version__}")
     options = parser.parse_args(arguments)
     try:
         report(options.runs, options.out)

@@ -18,13 +18,13 @@ the predicted `state` and `offsets`. They are predicted from row 0 of each toss 
 import argparse
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lcplearn import __version__
 from lcplearn.datasets import Task, read_all_cube_slides, read_recordings
 from lcplearn.datasets.files import find, read_npz
 from lcplearn.datasets.inputs import FRICTION, Inputs, read_inputs
@@ -108,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--trust", action="store_true", help="import the model's class from any module that the file names"
     )
-    parser.add_argument("--version", action="version", version=f"lcplearn {version('lcplearn')}")
+    parser.add_argument("--version", action="version", version=f"lcplearn {__version__}")
     options = parser.parse_args(arguments)
     if options.score and (options.state or options.plot):
         parser.error("--state and --plot go with --input")

@@ -209,4 +209,5 @@ def _task(found: Tosses, learn: list[int], choose: list[int], judge: list[int]) 
         },
         judged_by=("tosses",),
         chosen_by="pose",
+        positions=True,
     )

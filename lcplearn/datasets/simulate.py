@@ -185,7 +185,7 @@ def simulate_falling_block(
         path = block.rollout(start, drive.force)
         recordings[split.name] = split.recordings(path.states, drive, noise, 1)
     given = {"gravity": gravity}
-    return Task("falling_block", LINE, dt, **recordings, given=given, truth={"mass": mass}, scene=block)
+    return Task("falling_block", LINE, dt, **recordings, given=given, truth={"mass": mass}, scene=block, positions=True)
 
 
 def _slide(block: SlidingBlock, start: Float[Tensor, " N"], forces: Float[Tensor, "N T"]) -> Float[Tensor, "N T+1"]:

@@ -121,4 +121,4 @@ def simulate_planar_body(
         recordings[split.name] = split.recordings(path.states, drive, noise * scale, 3)
     given = {"gravity": gravity, "mass": mass, "corners": corners.tolist()}
     truth = {"mu": mu, "inertia": inertia, "restitution": restitution}
-    return Task("planar_body", PLANE, dt, **recordings, given=given, truth=truth, scene=body)
+    return Task("planar_body", PLANE, dt, **recordings, given=given, truth=truth, scene=body, positions=True)

@@ -60,4 +60,4 @@ def simulate_spring_block(
         path = block.rollout(start, drive.force)
         recordings[split.name] = split.recordings(path.states, drive, noise, 2)
     given, truth = {"mass": mass, "gravity": gravity}, {"stiffness": stiffness, "mu": mu}
-    return Task("spring_block", block.space, dt, **recordings, given=given, truth=truth, scene=block)
+    return Task("spring_block", block.space, dt, **recordings, given=given, truth=truth, scene=block, positions=True)

@@ -36,6 +36,7 @@ class Task:
         scene: What made the recordings; None if they are not simulated.
         chosen_by: What the best model of a training is chosen by, on the validation recordings: "rollout", its velocity
             error over windows, or "pose", its pose error over whole recordings.
+        positions: Whether velocities change with positions, so that models without contact structure should see them.
 
     Raises:
         ValueError: A shape doesn't fit the space, recordings have no step, or dt is not positive.
@@ -53,6 +54,7 @@ class Task:
     judged_by: tuple[str, ...] = MOTION
     scene: Scene | None = None
     chosen_by: str = "rollout"
+    positions: bool = False
 
     def __post_init__(self) -> None:
         positive("dt", self.dt)
