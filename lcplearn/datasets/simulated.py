@@ -46,7 +46,7 @@ class Split:
         return levels.gather(1, last.unsqueeze(-1).expand(-1, -1, axes))
 
     def recordings(
-        self, states: Float[Tensor, "N T+1 columns"], drive: Drive, noise: float | Tensor, noisy: int
+        self, states: Float[Tensor, "N instants columns"], drive: Drive, noise: float | Tensor, noisy: int
     ) -> Recordings:
         """Measure the last `noisy` columns of the states with noise, except in test and test_long."""
         error = noise * self.normal(self.steps + 1, noisy)

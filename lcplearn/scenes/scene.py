@@ -74,7 +74,7 @@ class Trajectory(NamedTuple):
     solved: Bool[Tensor, "*batch T"] | None = None
 
     @property
-    def states(self) -> Float[Tensor, "*batch T+1 nq_plus_nv"]:
+    def states(self) -> Float[Tensor, "*batch instants nq_plus_nv"]:
         """Positions, then velocities."""
         return torch.cat((self.positions, self.velocities), dim=-1)
 

@@ -11,6 +11,8 @@ from lcplearn.lcp.solution import LCPSolution
 from lcplearn.scenes.scene import STICK_SPEED, Drive, Mode, Step
 from lcplearn.scenes.space import LINE
 
+Numbers = Float[Tensor, "*batch"]
+Pairs = Float[Tensor, "*batch 2"]
 Prediction = tuple[Tensor, LCPSolution | None]
 
 
@@ -29,12 +31,7 @@ class LineFormulation(Formulation):
         super().__init__(space=LINE, dt=dt, given={"gravity": positive("gravity", gravity)})
         self.gravity = float(gravity)
 
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
+    def predict(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Prediction:
         """Predict the velocity one step later.
 
         Args:
@@ -47,12 +44,7 @@ class LineFormulation(Formulation):
         """
         raise NotImplementedError
 
-    def next_velocity(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
+    def next_velocity(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Numbers:
         """Velocity after a step [m/s], see `predict`."""
         return self.predict(velocity, force, friction)[0]
 
