@@ -10,6 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lcplearn.domains import POSITIVE, REAL, Domain
+
 PUBLISHED = {"cube_slides.npz": "slides", "cube_tosses.npz": "tosses", "planar_pushes.npz": "pushes"}
 
 
@@ -89,25 +91,18 @@ def replace(path: Path | str, write: Callable[[BinaryIO], Any]) -> None:
 
 
 def positive_number(path: Path | str, name: str, value: NDArray) -> float:
-    """The positive number in an array of one.
-
-    Raises:
-        ValueError: It is not one positive number.
-    """
-    found = number(path, name, value)
-    if not found > 0:
-        raise ValueError(f"{path}: {name}: expected one positive number, got {value}")
-    return found
+    """The positive number in an array of one; see `number`."""
+    return number(path, name, value, POSITIVE)
 
 
-def number(path: Path | str, name: str, value: NDArray) -> float:
+def number(path: Path | str, name: str, value: NDArray, domain: Domain = REAL) -> float:
     """The number in an array of one.
 
     Raises:
-        ValueError: It is not one number.
+        ValueError: It is not one number of the domain.
     """
-    if value.size != 1 or value.dtype.kind not in "fiu":
-        raise ValueError(f"{path}: {name}: expected one number, got {value}")
+    if value.size != 1 or value.dtype.kind not in "fiu" or value.item() not in domain:
+        raise ValueError(f"{path}: {name}: expected {domain.words}, got {value}")
     return float(value.item())
 
 

@@ -19,7 +19,7 @@ from lcplearn.formulations.pushing import PushModel
 from lcplearn.scenes.scene import Drive
 from lcplearn.scenes.space import POSE
 from lcplearn.training.optimizer import Optimizer
-from lcplearn.training.settings import SettingsError, check
+from lcplearn.training.settings import SettingsError, check, check_torchrun
 from lcplearn.training.signatures import signature
 from lcplearn.training.vocabulary import TRAINER, explain
 
@@ -174,6 +174,21 @@ def test_processes_of_torchrun_that_would_each_train_alone_are_refused(more: str
     together = ["trainer.strategy=ddp", "trainer.devices=2"]
     check(settings(*together), CONF, processes=2)
     check(settings(*together, "+trainer.num_nodes=3"), CONF, processes=6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("trainer.strategy=ddp", "torchrun's processes need one folder: add hydra.run.dir=runs/NAME."),
+        ("-m seed=0,1", "torchrun trains one run: sweep (-m) without it, with trainer.strategy=ddp_fork."),
+    ],
+)
+def test_processes_of_torchrun_that_would_write_two_runs_are_refused(arguments: str, sentence: str) -> None:
+    with pytest.raises(SettingsError) as error:
+        check_torchrun(arguments.split())
+    assert str(error.value) == sentence
+    check_torchrun(["trainer.strategy=ddp", "hydra.run.dir=runs/pair"])
+    check_torchrun(["--cfg", "job"])
 
 
 @pytest.mark.parametrize(
