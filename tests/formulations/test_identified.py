@@ -8,7 +8,7 @@ from typing import ClassVar
 import pytest
 import torch
 from torch import Tensor
-from training.helpers import QUIET
+from training.helpers import QUIET, short_fit
 
 import lcplearn
 from lcplearn.datasets import Recordings, Task, simulate_sliding_block
@@ -75,8 +75,8 @@ def test_a_spring_and_its_friction_are_learned_with_the_loop_closed(tmp_path: Pa
         given=task.given,
         learn={"stiffness": 10.0, "mu": 0.05},
     )
-    fitted = fit(model, task, loss={"rollout": 1.0}, horizon=10, epochs=80, optimizer=Optimizer(lbfgs_after=60),
-                 folder=tmp_path, trainer=QUIET)  # fmt: skip
+    fitted = short_fit(model, task, tmp_path, loss={"rollout": 1.0}, horizon=10, epochs=80,
+                       optimizer=Optimizer(lbfgs_after=60), trainer=QUIET)  # fmt: skip
     assert fitted.metrics is not None
     assert fitted.metrics["stiffness_error"] <= 1e-5
     assert fitted.metrics["mu_error"] <= 1e-7
