@@ -96,6 +96,7 @@ def check_recordings(name: str, part: Recordings, space: Space) -> None:
     for field_name, tensor, _ in shapes:
         if field_name in masks and tensor is not None and not bool(tensor[masks[field_name]].isfinite().all()):
             raise ValueError(f"{name}.{field_name}: expected finite numbers, got NaN or infinity")
+    space.normalised(states[known], f"{name}.states")  # refuses what is no rotation
 
 
 def read_recordings(

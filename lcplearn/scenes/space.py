@@ -67,7 +67,9 @@ class Space:
             )
         return state[..., : self.nq], state[..., self.nq :]
 
-    def normalised(self, state: Float[Tensor, "*batch nq_plus_nv"]) -> Float[Tensor, "*batch nq_plus_nv"]:
+    def normalised(
+        self, state: Float[Tensor, "*batch nq_plus_nv"], name: str = "state"
+    ) -> Float[Tensor, "*batch nq_plus_nv"]:
         """The state with a quaternion of norm 1, where it has one.
 
         Raises:
@@ -79,7 +81,7 @@ class Space:
         norm = position[..., -4:].norm(dim=-1, keepdim=True)
         if not bool(((norm - 1.0).abs() < 1e-3).all()):
             worst = norm.flatten()[(norm - 1.0).abs().argmax()].item()
-            raise ValueError(f"state: expected a quaternion of norm 1, got one of norm {worst:.6g}")
+            raise ValueError(f"{name}: expected a quaternion of norm 1, got one of norm {worst:.6g}")
         return torch.cat((position[..., :-4], position[..., -4:] / norm, velocity), dim=-1)
 
     def advance(

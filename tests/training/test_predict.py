@@ -221,7 +221,7 @@ def test_steps_without_a_solution_are_said(tmp_path: Path, capsys: pytest.Captur
     out = tmp_path / "motion.csv"
     predict.main([str(tmp_path / "unsolvable.ckpt"), "--input", str(tmp_path / "forces.csv"), "--output", str(out)])
     assert "2 of all steps without a verified solution" in capsys.readouterr().out
-    assert [row["solved"] for row in csv.DictReader(out.open())] == ["", "0", "0"]
+    assert [row["solved"] for row in csv.DictReader(out.read_text().splitlines())] == ["", "0", "0"]
 
 
 def test_a_checkpoint_imports_no_scene_that_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
