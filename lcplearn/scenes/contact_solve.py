@@ -8,13 +8,16 @@ from torch import Tensor
 
 from lcplearn.scenes.contact_gradient import attach_gradient
 from lcplearn.scenes.friction_lcp import (
+    CRUDE,
     DEAD_ZONE,
     FULL_RANK,
     MAX_ITERATIONS,
+    PATIENCE,
     PLAIN,
     PROXIMAL,
     ROUNDING,
     SETTLED,
+    STAYS,
     Answer,
     Problem,
     cone_lcp,
@@ -86,9 +89,13 @@ def _iterate(part: Problem) -> Answer:
     for iteration in range(MAX_ITERATIONS):
         soft = PROXIMAL * part.mobility() if iteration >= PLAIN else torch.zeros_like(part.target)
         softer = part._replace(compliance=part.compliance + soft, target=part.target + soft * guess.normal)
-        new = cone_lcp(softer, guess, iteration)
-        away = (soft * (new.normal - guess.normal).abs() / part.speed_scale().clamp_min(1e-300)).amax(-1)
-        new = new._replace(settled=torch.maximum(law_violation(part, new), away) <= SETTLED)
+        new = cone_lcp(softer, guess)
+        change = part.mass_norm(new.velocity - guess.velocity)
+        away = soft * (new.normal - guess.normal).abs() / part.speed_scale().clamp_min(1e-300)
+        wrong = torch.maximum(law_violation(part, new), away.amax(-1))
+        stays = change <= STAYS * (part.mass_norm(part.free) + part.mass_norm(new.velocity))
+        enough = stays & (wrong <= CRUDE) & (iteration >= PATIENCE)
+        new = new._replace(settled=(wrong <= SETTLED) | enough)
         result.put(todo, None, new)
         going = torch.nonzero(~(new.settled & new.solved))[:, 0]
         if not len(going):

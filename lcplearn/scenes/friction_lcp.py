@@ -4,7 +4,7 @@
 
     |f_t| <= mu lambda,     f_s = -weight v_s,     weight = mu lambda / |slip|,
 
-with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is a few times `CREEP`, t is
+with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is below `CREEPS`, t is
 along the friction force, and the slip in the weight is at least `CREEP`. At the fixed point v_s = 0 (slip) or f_s = 0
 (stick), so that this is Coulomb's law, and its derivative: what changes the weight multiplies v_s = 0.
 
@@ -21,8 +21,9 @@ carries them. An iteration that has not settled after `PLAIN` LCPs goes on with 
 by p = `PROXIMAL` / (n mass^-1 n'), the target by p times the load of the iterate before. What it settles at solves the
 same law.
 
-Corners of a body that comes to rest may contradict each other: all stick, but for speeds of 1e-9 of the free velocity.
-What has not settled by then goes through LCPs with `LEAST_CREEP`, where friction grows to its limit at such a slip.
+Corners of a body that comes to rest may contradict each other: none may slip, yet each moves up or down at its own
+speed of 1e-6 and less, and turns the body by it. Then they creep, as a slip of `CREEP` stands for none, and friction
+grows from LCP to LCP. After `PATIENCE` of them a velocity that stays counts as settled if the law holds to `CRUDE`.
 
 Source: NOTES 5.7; the rows of a polygon: Stewart and Trinkle 1996.
 """
@@ -44,8 +45,10 @@ DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relati
 FULL_RANK = 1e-6  # smallest eigenvalue of the rows that hold a body at rest, relative to their largest diagonal
 ROUNDING = 1e-13  # of speeds, relative to those of free flight
 CREEP = 1e-8  # speed that stands for the slip at stick, likewise
-LEAST_CREEP = 1e-12
-SHARP = (20, 40)  # the LCPs that take it
+CREEPS = 10.0 * CREEP  # a slip as small as what a weight leaves over; it has no direction worth following
+PATIENCE = 45
+STAYS = 1e-10  # change of velocity from one iterate to the next, relative in the mass norm
+CRUDE = 1e-6  # violation of the law, likewise
 
 
 class Problem(NamedTuple):
@@ -152,19 +155,14 @@ def frictionless_lcp(problem: Problem) -> Answer:
     return Answer(velocity, solution.z, none, none, solution.z < 0.0, solution.solved, solution.solved)
 
 
-def creep(iteration: int) -> float:
-    """Speed that stands for the slip at stick in an LCP of the iteration, relative to that of free flight."""
-    return LEAST_CREEP if SHARP[0] <= iteration <= SHARP[1] else CREEP
-
-
-def cone_lcp(problem: Problem, guide: Answer | None, iteration: int = 0) -> Answer:
+def cone_lcp(problem: Problem, guide: Answer | None) -> Answer:
     """Three rows a contact; with two friction directions their facets and weights are those of the guide."""
     K, mu = problem.mu.shape[-1], problem.mu
     eye = torch.eye(K, dtype=mu.dtype, device=mu.device)
     if problem.directions == 1:
         axes = torch.ones_like(problem.tangents[..., :1, :1])
     else:
-        axes, weight = _facets(problem, guide, creep(iteration))
+        axes, weight = _facets(problem, guide)
     along = axes @ problem.tangents  # t, or t and s
     A, speed, response = _delassus(problem, torch.cat((problem.normal, *along.unbind(-2)), dim=-2))
     if problem.directions == 2:
@@ -243,20 +241,19 @@ def polygon_lcp(problem: Problem, k: int) -> Answer:
     return Answer(velocity, z[:, :K], friction, slip, z[:, size:] == 0.0, solution.solved, solution.solved)
 
 
-def _facets(problem: Problem, guide: Answer | None, least: float) -> tuple[Tensor, Tensor]:
+def _facets(problem: Problem, guide: Answer | None) -> tuple[Tensor, Tensor]:
     """Axes t, s [B, K, 2, 2] and the weight across [B, K], from the iterate before; constants for the gradient."""
     if guide is None:
         raise ValueError("guide: expected an iterate, got None")
     with torch.no_grad():
         slip = torch.linalg.vector_norm(guide.slip, dim=-1)
-        creeping = least * problem.speed_scale()
-        # A slip as small as what a weight leaves over has no direction worth following.
-        sticks = guide.sticks | (slip <= 10.0 * creeping)
+        scale = problem.speed_scale()
+        sticks = guide.sticks | (slip <= CREEPS * scale)
         direction = torch.where(sticks.unsqueeze(-1), -guide.friction, guide.slip)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         some = length > 0.0
         t = torch.where(some, direction / torch.where(some, length, 1.0), direction.new_tensor([1.0, 0.0]))
-        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), creeping)
+        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), CREEP * scale)
         s = torch.stack((-t[..., 1], t[..., 0]), dim=-1)
         weight = torch.where(speed > 0.0, problem.mu * guide.normal / torch.where(speed > 0.0, speed, 1.0), 0.0)
         return torch.stack((t, s), dim=-2), weight

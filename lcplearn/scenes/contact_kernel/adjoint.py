@@ -11,7 +11,7 @@ import numpy as np
 
 from lcplearn.scenes.contact_gradient import RANK
 from lcplearn.scenes.contact_kernel.compiling import compiled
-from lcplearn.scenes.friction_lcp import CREEP
+from lcplearn.scenes.friction_lcp import CREEPS
 
 SINGULAR = 1e-10  # pivots below this, of rows whose largest entry is 1, are those of redundant contacts
 SWEEPS = 30  # of Jacobi's rotations; about 8 are needed
@@ -178,7 +178,7 @@ def pull_back_contacts(
             for k in range(nv):
                 slip[c, t] += rows[w * c + 1 + t, k] * v[k]
             size += slip[c, t] ** 2
-        stuck[c] = sticks[c] or sqrt(size) <= 10.0 * CREEP * sqrt(unit[c] * energy)
+        stuck[c] = sticks[c] or sqrt(size) <= CREEPS * sqrt(unit[c] * energy)
     for i in range(w * K):
         wanted[i] = y_gradient[i]
         for k in range(nv):

@@ -6,10 +6,17 @@ import numpy as np
 
 from lcplearn.scenes.contact_kernel.compiling import compiled
 from lcplearn.scenes.contact_kernel.rows import apply, condense, cone_rows, delassus, mass_norm, rotate, solve_lcp
-from lcplearn.scenes.friction_lcp import MAX_ITERATIONS, PLAIN, PROXIMAL, SETTLED
-from lcplearn.scenes.friction_lcp import creep as creep_of
-
-_creep = compiled(creep_of)
+from lcplearn.scenes.friction_lcp import (
+    CREEP,
+    CREEPS,
+    CRUDE,
+    MAX_ITERATIONS,
+    PATIENCE,
+    PLAIN,
+    PROXIMAL,
+    SETTLED,
+    STAYS,
+)
 
 
 @compiled
@@ -24,13 +31,13 @@ def workspace(C, nv):
 
 
 @compiled
-def _choose_axes(slip, friction, load, sticks, mu, scale, least, K, axes, root):
+def _choose_axes(slip, friction, load, sticks, mu, scale, K, axes, root):
     """Facets along the slip or against the friction force, and the root of the weight across them."""
     for i in range(K):
         speed = sqrt(slip[i, 0] ** 2 + slip[i, 1] ** 2)
-        creep = least * scale[i]
+        creep = CREEP * scale[i]
         x, y = slip[i, 0], slip[i, 1]
-        if sticks[i] or speed <= 10.0 * creep:
+        if sticks[i] or speed <= CREEPS * scale[i]:
             x, y = -friction[i, 0], -friction[i, 1]
         length = sqrt(x * x + y * y)
         axes[i, 0], axes[i, 1] = (x / length, y / length) if length > 0.0 else (1.0, 0.0)
@@ -94,7 +101,7 @@ def solve_cone(
         slip[i, 0], slip[i, 1] = u[K + i], u[2 * K + i]
         sticks[i] = False
     v[:] = free
-    old, was_damped = np.inf, False
+    size, old, was_damped = mass_norm(mass, free, nv), np.inf, False
     solved = settled = False
     for iteration in range(MAX_ITERATIONS):
         proximal = PROXIMAL if iteration >= PLAIN else 0.0
@@ -102,7 +109,7 @@ def solve_cone(
             soft[i] = compliance[i] + proximal * D[i, i]
             goal[i] = target[i] + proximal * D[i, i] * load[i]
             old_load[i], old_friction[i, 0], old_friction[i, 1] = load[i], friction[i, 0], friction[i, 1]
-        _choose_axes(slip, friction, load, sticks, mu, scale, _creep(iteration), K, axes, root)
+        _choose_axes(slip, friction, load, sticks, mu, scale, K, axes, root)
         rotate(D, u, axes, K, A, r)
         condense(A, r, root, K, H, X)
         cone_rows(A, r, goal, mu, soft, K, M, q)
@@ -112,12 +119,13 @@ def solve_cone(
         wrong = _law_violation(slip, friction, load, mu, D, scale, K)
         for i in range(K):
             wrong = max(wrong, proximal * D[i, i] * abs(load[i] - old_load[i]) / max(scale[i], 1e-300))
-        settled = wrong <= SETTLED
-        if (settled and solved) or iteration == MAX_ITERATIONS - 1:
-            break
         for k in range(nv):
             v[k] -= v_new[k]
         change = mass_norm(mass, v, nv)
+        stays = change <= STAYS * (size + mass_norm(mass, v_new, nv))
+        settled = wrong <= SETTLED or (stays and wrong <= CRUDE and iteration >= PATIENCE)
+        if (settled and solved) or iteration == MAX_ITERATIONS - 1:
+            break
         damped = change > 0.3 * old and not was_damped and 3 < iteration < PLAIN
         if damped:
             for k in range(nv):
