@@ -50,7 +50,7 @@ def write(path: str | Path, trajectory: Trajectory, model: Formulation) -> None:
     writer = csv.writer(text)
     writer.writerow(("time_s", *model.space.positions, *model.space.velocities, *modes, *solved))
     for instant, position, velocity, step in zip(time, positions.tolist(), velocities.tolist(), steps, strict=True):
-        writer.writerow((float(instant), *position, *velocity, *step))
+        writer.writerow((f"{instant:.12g}", *position, *velocity, *step))  # 0.15, not 0.15000000000000002
     replace(path, lambda file: file.write(text.getvalue().encode()))
 
 
