@@ -53,7 +53,7 @@ def write_tosses(path: Path | str, predicted: Float[Tensor, "N rows 13"], tosses
     """Write `state` and `offsets` as the file of the recorded tosses has them."""
     path = Path(path)
     if path.suffix != ".npz":
-        raise ValueError(f"{path} must end in .npz.")
+        raise ValueError(f"{path}: expected a name that ends in .npz")
     offsets = np.concatenate(([0], np.cumsum(tosses.steps.numpy() + 1)))
     state = in_file_units(predicted, tosses.steps, tosses.half_width)
     replace(path, lambda file: np.savez_compressed(file, state=state, offsets=offsets))
