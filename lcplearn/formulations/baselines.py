@@ -1,5 +1,7 @@
 """Baselines without contact structure: none of them can hold a body exactly at rest."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -58,11 +60,19 @@ class Affine(Baseline):
         unseen = torch.zeros(space.nv, self.inputs - 2 * space.nv, dtype=torch.float64)
         self.weight = nn.Parameter(torch.cat((unseen, one, one), dim=-1))
         self.bias = nn.Parameter(torch.zeros(space.nv, dtype=torch.float64))
+        self.register_load_state_dict_pre_hook(_as_rows)
 
     def next_velocity(
         self, velocity: Float[Tensor, "*batch nv"], inputs: Float[Tensor, "*batch n"]
     ) -> Float[Tensor, "*batch nv"]:
         return nn.functional.linear(inputs, self.weight, self.bias)
+
+
+def _as_rows(module: nn.Module, state: dict[str, Tensor], prefix: str, *others: Any) -> None:
+    """Checkpoints of version 0.1, of one velocity, have a row without its dimension."""
+    for name, parameter in module.named_parameters():
+        if (saved := state.get(prefix + name)) is not None and saved.numel() == parameter.numel():
+            state[prefix + name] = saved.reshape(parameter.shape)
 
 
 class MLP(Baseline):

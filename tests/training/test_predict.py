@@ -238,6 +238,24 @@ def test_a_checkpoint_imports_no_scene_that_is_not_trusted(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize(
+    ("name", "state", "velocity"),
+    [
+        ("baselines.Affine", {"weight": torch.tensor([1.0, 0.5]), "bias": torch.tensor(0.25)}, 1.0 + 0.5 * 0.2 + 0.25),
+        ("structured.Physical", {"log_mu": torch.tensor(0.5).log(), "log_mass": torch.tensor(2.0).log()}, 0.61),
+    ],
+)
+def test_checkpoints_of_version_0_1_predict_as_they_did(
+    name: str, state: dict[str, torch.Tensor], velocity: float, tmp_path: Path
+) -> None:
+    """From 1 m/s, under 2 N for 0.1 s; classes stood elsewhere, parameters had other shapes or names."""
+    saved = {"class": f"lcplearn.formulations.{name}", "arguments": {"dt": 0.1, "gravity": 9.8}}
+    state = {f"model.{key}": value.double() for key, value in state.items()}
+    torch.save({"formulation": saved, "state_dict": state}, tmp_path / "old.ckpt")
+    start, force = torch.tensor([0.0, 1.0]), torch.tensor([2.0])
+    assert lcplearn.load(tmp_path / "old.ckpt").step(start, force)[1].item() == pytest.approx(velocity)
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"forces": np.zeros((2, 0))}, "forces: expected at least one step"),
