@@ -78,7 +78,11 @@ class Identified(Formulation):
 
     def numbers(self) -> dict[str, Tensor]:
         """The learned numbers, differentiable."""
-        return {name: _bound(self.free[name], domain) for name, domain in self.domains.items()}
+        return self.bound({name: self.free[name] for name in self.domains})
+
+    def bound(self, free: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The numbers that free parameters, which may be any number, stand for."""
+        return {name: _bound(free[name], domain) for name, domain in self.domains.items()}
 
     def moving(self) -> Scene:
         numbers: dict[str, Any] = {**self.fixed, **self.numbers()}
@@ -95,10 +99,9 @@ class Identified(Formulation):
         if free.requires_grad:
             free.register_hook(lambda gradients: clip_rows(gradients, self.clip))
         parts = free.split([self.free[name].numel() for name in self.domains], dim=-1)
-        numbers = {
-            name: _bound(part.reshape(count, *self.free[name].shape), domain)
-            for (name, domain), part in zip(self.domains.items(), parts, strict=True)
-        }
+        numbers = self.bound(
+            {name: part.reshape(count, *self.free[name].shape) for name, part in zip(self.domains, parts, strict=True)}
+        )
         scene: Scene = self.scene_type(dt=self.dt, **{**self.fixed, **numbers})
         return scene
 
