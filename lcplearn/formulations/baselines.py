@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lcplearn.datasets.recordings import Windows
 from lcplearn.formulations.formulation import Formulation
 from lcplearn.formulations.networks import network
 from lcplearn.scenes.scene import STICK_SPEED, Drive, Mode, Step
@@ -33,12 +34,19 @@ class Baseline(Formulation):
         raise NotImplementedError
 
     def advance(self, state: Float[Tensor, "*batch nq_plus_nv"], drive: Drive) -> Step:
-        position, velocity = self.space.split(state)
-        inputs = torch.cat((state[..., self.first :], drive.force * self.dt), dim=-1)
-        velocity = self.next_velocity(velocity, inputs)
+        position, velocity = self.space.split(state)[0], self._velocity_after(state, drive)
         rests = self.space.speed(velocity, self.radius) < STICK_SPEED
         mode = torch.where(rests, int(Mode.STICK), int(Mode.SLIP)).unsqueeze(-1)
         return Step(torch.cat((self.space.advance(position, velocity, self.dt), velocity), dim=-1), mode)
+
+    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        # As the base class has it, without the positions and modes, which it does not read.
+        after = self._velocity_after(windows.states[:, 0], windows.drive.at(0))
+        return self.space.squared_speed(after - windows.states[:, 1, self.space.nq :], self.radius)
+
+    def _velocity_after(self, state: Tensor, drive: Drive) -> Tensor:
+        inputs = torch.cat((state[..., self.first :], drive.force * self.dt), dim=-1)
+        return self.next_velocity(state[..., self.space.nq :], inputs)
 
 
 class Affine(Baseline):

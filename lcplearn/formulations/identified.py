@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from lcplearn.datasets.recordings import Windows
 from lcplearn.domains import Domain
 from lcplearn.formulations.formulation import Formulation
+from lcplearn.formulations.line.formulation import path_error, step_error
 from lcplearn.scenes.scene import Drive, Scene, Step
 from lcplearn.scenes.sliding_block import SlidingBlock
 
@@ -154,6 +155,16 @@ class Physical(Identified):
         # A mass that is not learned is for data without force, where it has no effect: they may have another.
         self.given = {"gravity": gravity}
         self.register_load_state_dict_pre_hook(_rename)
+
+    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        return step_error(self._next_velocity(), windows)
+
+    def rollout_error(self, windows: Windows) -> Float[Tensor, "B k"]:
+        return path_error(self._next_velocity(), windows)
+
+    def _next_velocity(self) -> Callable[..., Tensor]:
+        block: Any = self.moving()
+        return lambda velocity, force, friction: block.next_velocity(velocity, force)
 
 
 def _rename(module: nn.Module, state: dict[str, Any], prefix: str, *others: Any) -> None:
