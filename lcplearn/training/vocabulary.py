@@ -27,7 +27,7 @@ def explain(message: str, conf: Path) -> str:
         group, choice = missing[1], missing[2]
         if group == "hydra/launcher":
             return f"There is no {group}={choice} among the installed ones; joblib's is in the extra 'sweep'."
-        options = [file.stem for file in (conf / group).glob("*.yaml")]
+        options = re.findall(r"^\t([\w-]+)$", message, re.MULTILINE)  # Hydra lists those of every folder it searches
         return f"There is no {group}={choice}; {suggestion(choice, options)}"
     if named:
         group, _, key = named[1].rpartition(".")
