@@ -54,7 +54,7 @@ EVERY = [choice for choice in EVERY if choice not in PUSHES]
 @pytest.fixture(scope="module")
 def tasks() -> dict[str, Task]:
     """By a part of the names of its configurations; one of a sliding block is for everything else."""
-    state = torch.zeros(1, 2, 13, dtype=torch.float64)
+    state = torch.eye(13, dtype=torch.float64)[3].expand(1, 2, 13)  # at rest, not turned
     one = Recordings(state, Drive(torch.zeros(1, 1, 6, dtype=torch.float64)), torch.tensor([1]))
     given = {"half_width": 0.05, "mass": 0.4, "gravity": 9.81, "inertia": 8e-4, "mu": 0.2, "restitution": 0.1}
     cube = Task(name="tosses", space=POSE, dt=0.01, train=one, validation=one, test=one, given=given)
