@@ -10,14 +10,15 @@ import math
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 from hydra.experimental.callback import Callback
 
+from lcplearn import __version__
 from lcplearn.training.figures_of_merit import KEYS, figure, in_order
+from lcplearn.training.settings import flat
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -157,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m lcplearn.compare", description=__doc__.split("\n\n")[0])
     parser.add_argument("runs", nargs="+", metavar="RUNS", help="run folders, or folders above them")
     parser.add_argument("--out", default=".", help="folder for compare.md and compare.png (default: here)")
-    parser.add_argument("--version", action="version", version=f"lcplearn {version('lcplearn')}")
+    parser.add_argument("--version", action="version", version=f"lcplearn {__version__}")
     options = parser.parse_args(arguments)
     try:
         report(options.runs, options.out)
@@ -177,19 +178,19 @@ def _read(path: Path, parse: Any) -> dict[str, Any]:
 
 def _labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Name of the model's class, and whatever else differs."""
-    flat = [_flatten(config) for config in configs]
-    names = {group: [_class_name(config, group) for config in flat] for group in ("model", "data")}
+    settings = [flat(config) for config in configs]
+    names = {group: [_class_name(config, group) for config in settings] for group in ("model", "data")}
     labels = []
-    for config, model, data in zip(flat, names["model"], names["data"], strict=True):
+    for config, model, data in zip(settings, names["model"], names["data"], strict=True):
         parts = [model, *([f"data={data}"] if len(set(names["data"])) > 1 else [])]
-        for key in sorted({key for other in flat for key in other}):
+        for key in sorted({key for other in settings for key in other}):
             if key.startswith(_SILENT) or key in ("model._target_", "data._target_"):
                 continue
             # What a model or a data set brings along is no difference to others.
             owner = "model" if key.startswith("data.friction") else key.partition(".")[0]
             owners = names.get(owner, names["model"])
             mine = {"model": model, "data": data}.get(owner)
-            values = [other.get(key) for other, name in zip(flat, owners, strict=True) if mine in (None, name)]
+            values = [other.get(key) for other, name in zip(settings, owners, strict=True) if mine in (None, name)]
             if any(value != values[0] for value in values):
                 parts.append(f"{key}={config.get(key)}")
         labels.append(" ".join(parts))
@@ -198,13 +199,6 @@ def _labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _class_name(config: Mapping[str, Any], group: str) -> str:
     return str(config.get(f"{group}._target_", "?")).rpartition(".")[2]
-
-
-def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
 
 
 def _row(label: str, configs: Sequence[Mapping[str, Any]], runs: Sequence[Mapping[str, Any]]) -> Row:

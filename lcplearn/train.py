@@ -88,16 +88,21 @@ def train(config: DictConfig) -> float:
         print(error)  # a sweep goes on
         return math.inf
     except TrainingInterrupted as stop:
-        searched = [override for override in run.overrides.hydra if override.startswith("hydra.searchpath=")]
-        overrides = searched + [override for override in run.overrides.task if not override.startswith("ckpt_path=")]
-        name = "lcplearn train" if Path(sys.argv[0]) == HERE else "python train.py"
-        arguments = shlex.join([*overrides, f"ckpt_path={os.path.relpath(stop.checkpoint)}"])
-        raise KeyboardInterrupt(f"Stopped; to go on: {name} {arguments}") from None
+        raise KeyboardInterrupt(f"Stopped; to go on: {_command_from(stop.checkpoint)}") from None
     if result.metrics is not None:
         learned = ", ".join(f"{name} = {value:.6g}" for name, value in result.model.physical_parameters().items())
         print(f"\n{format_table(result.metrics)}" + (f"\n\nlearned: {learned}" if learned else ""))
         print(f"\nrun folder: {os.path.relpath(result.folder)}")
     return result.validation
+
+
+def _command_from(checkpoint: Path) -> str:
+    """The command line of this run, resumed."""
+    overrides = HydraConfig.get().overrides
+    searched = [override for override in overrides.hydra if override.startswith("hydra.searchpath=")]
+    task = [override for override in overrides.task if not override.startswith("ckpt_path=")]
+    name = "lcplearn train" if Path(sys.argv[0]) == HERE else "python train.py"
+    return f"{name} {shlex.join([*searched, *task, f'ckpt_path={os.path.relpath(checkpoint)}'])}"
 
 
 def train_pushes(config: DictConfig, data: Any, settings: dict[str, Any], folder: str) -> float:
@@ -119,7 +124,7 @@ def train_pushes(config: DictConfig, data: Any, settings: dict[str, Any], folder
 
 def sentence(error: BaseException) -> str:
     """What a user can do about an error, in one sentence."""
-    from lcplearn.training.settings import explain
+    from lcplearn.training.vocabulary import explain
 
     failed_call = isinstance(error, InstantiationException) and error.__cause__ is not None
     cause = error.__cause__ if failed_call else error

@@ -28,8 +28,7 @@ def simulate_ramp(
     for number in range(3):
         generator = torch.Generator().manual_seed(3 * seed + number)
         force = 4.0 * torch.randn(10, length, 1, generator=generator, dtype=torch.float64)  # [N, T, nv], in newtons
-        path = scene.rollout(torch.zeros(10, 2, dtype=torch.float64), force)
-        true = torch.cat((path.positions, path.velocities), dim=-1)  # [N, T + 1, nq + nv]
+        true = scene.rollout(torch.zeros(10, 2, dtype=torch.float64), force).states  # [N, T + 1, nq + nv]
         wrong = torch.rand(true.shape[:-1], generator=generator) < outliers * (number < 2)
         recorded = true + wrong.unsqueeze(-1) * torch.tensor([0.0, 1.0])
         steps = torch.full((10,), length)  # shorter recordings are padded at their ends, and say so here

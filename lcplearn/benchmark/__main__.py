@@ -20,6 +20,7 @@ STUDIES = {
     "engines": "the Stick Bench: scenes with an exact answer, beside physics engines",
     "models": "learned formulations: error against time, samples and noise",
     "pushes": "real pushes: gradients, times, how many a model needs, planning with a learned one",
+    "tosses": "real tosses of a cube: learned bodies, simulators and a network on the same tosses; how many are needed",
     "overhead": "one problem a call, and memory",
     "devices": "problems a second on a CUDA device, beside the CPU kernel on all cores",
 }

@@ -1,15 +1,11 @@
-"""Turn the published ContactNets cube tosses into data files.
+"""Turn the published ContactNets cube tosses into the arrays of two data files; `lcplearn.datasets.get` writes them.
 
-Usage: python -m lcplearn.datasets.contactnets FOLDER --out data/
-
-FOLDER is `data/tosses_processed` in a clone of github.com/DAIRLab/contact-nets (BSD-3-Clause). Each toss is a file
-NUMBER.pt with a tensor [1, T, 19]: position (x, y, z), quaternion of the body in the world (w, x, y, z), velocity,
-angular velocity in the body frame, six unused controls; lengths in half widths of the cube, 148 rows a second.
+They are in `data/tosses_processed` of github.com/DAIRLab/contact-nets (BSD-3-Clause). Each toss is a file NUMBER.pt
+with a tensor [1, T, 19]: position (x, y, z), quaternion of the body in the world (w, x, y, z), velocity, angular
+velocity in the body frame, six unused controls; lengths in half widths of the cube, 148 rows a second.
 """
 
-import argparse
 import pickle
-import sys
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 
 from lcplearn.datasets.cube_slides import COLUMNS as SLIDE_COLUMNS
-from lcplearn.datasets.cube_slides import FILE as SLIDES_FILE
 
 TOSSES_FILE = "cube_tosses.npz"
 TOSS_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx_body", "wy_body", "wz_body")
@@ -170,26 +165,6 @@ def convert(folder: Path | str) -> tuple[dict[str, NDArray], dict[str, NDArray]]
     return toss_arrays, slide_arrays
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Write both files; what is wrong with the input ends the command with one sentence."""
-    parser = argparse.ArgumentParser(prog="python -m lcplearn.datasets.contactnets", description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the published files NUMBER.pt")
-    parser.add_argument("--out", type=Path, default=Path("data"), help="folder to write to (default: data)")
-    options = parser.parse_args(arguments)
-    try:
-        tosses, slides = convert(options.folder)
-        options.out.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(options.out / TOSSES_FILE, **tosses)  # type: ignore[arg-type]  # numpy types **arrays as flags
-        np.savez_compressed(options.out / SLIDES_FILE, **slides)  # type: ignore[arg-type]
-    except (OSError, ValueError) as error:
-        parser.exit(1, f"{error}\n")
-    sys.stdout.write(
-        f"{options.out / TOSSES_FILE}: {len(tosses['source_id'])} tosses\n"
-        f"{options.out / SLIDES_FILE}: {len(slides['source_id'])} slides\n"
-    )
-
-
 def _up_in_body(quaternions: NDArray) -> NDArray:
     """World z axis in body coordinates, [T, 3]: its product with a body point is the point's height."""
     w, x, y, z = quaternions.T
@@ -198,7 +173,3 @@ def _up_in_body(quaternions: NDArray) -> NDArray:
 
 def _offsets(records: list[NDArray]) -> NDArray:
     return np.cumsum([0, *(len(record) for record in records)], dtype=np.int64)
-
-
-if __name__ == "__main__":
-    main()

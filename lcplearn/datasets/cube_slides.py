@@ -34,7 +34,7 @@ def read_cube_slides(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not what `lcplearn.datasets.contactnets` writes, or has too few slides for the split.
+        ValueError: The file is not what `lcplearn.datasets.get` writes, or has too few slides for the split.
     """
     path = find(FILE) if path is None else Path(path)
     slides, constants = _read(path)
@@ -55,7 +55,7 @@ def read_all_cube_slides(path: Path | str) -> Task:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not what `lcplearn.datasets.contactnets` writes.
+        ValueError: The file is not what `lcplearn.datasets.get` writes.
     """
     slides, constants = _read(Path(path))
     everything = _recordings(slides)

@@ -89,7 +89,7 @@ def read_tosses(path: Path | str | None = None, *, only_starts: bool = False) ->
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not what `lcplearn.datasets.contactnets` writes.
+        ValueError: The file is not what `lcplearn.datasets.get` writes.
     """
     path = find(TOSSES_FILE) if path is None else Path(path)
     arrays = read_npz(
@@ -177,7 +177,7 @@ def read_cube_tosses(path: Path | str | None = None, *, seed: int = 0, tosses: i
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not what `lcplearn.datasets.contactnets` writes, or has too few tosses.
+        ValueError: The file is not what `lcplearn.datasets.get` writes, or has too few tosses.
     """
     found = read_tosses(path)
     learn, choose, rest = split(found.numbers, seed)
@@ -209,4 +209,5 @@ def _task(found: Tosses, learn: list[int], choose: list[int], judge: list[int]) 
         },
         judged_by=("tosses",),
         chosen_by="pose",
+        positions=True,
     )

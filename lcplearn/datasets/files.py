@@ -1,12 +1,16 @@
-"""Find and open data files; what is wrong with one is said in one sentence."""
+"""Find, open and write data files; what is wrong with one is said in one sentence."""
 
 import os
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lcplearn.domains import POSITIVE, REAL, Domain
 
 PUBLISHED = {"cube_slides.npz": "slides", "cube_tosses.npz": "tosses", "planar_pushes.npz": "pushes"}
 
@@ -71,14 +75,34 @@ def read_npz(
     return arrays
 
 
+def replace(path: Path | str, write: Callable[[BinaryIO], Any]) -> None:
+    """Write a file beside `path`, bring it to the disk, and put it in its place in one step.
+
+    Beside it, because a move from another file system is a copy, of which a kill leaves a part.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.part")
+    with beside.open("wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
+
+
 def positive_number(path: Path | str, name: str, value: NDArray) -> float:
+    """The positive number in an array of one; see `number`."""
+    return number(path, name, value, POSITIVE)
+
+
+def number(path: Path | str, name: str, value: NDArray, domain: Domain = REAL) -> float:
     """The number in an array of one.
 
     Raises:
-        ValueError: It is not one positive number.
+        ValueError: It is not one number of the domain.
     """
-    if value.size != 1 or value.dtype.kind not in "fiu" or not value.item() > 0:
-        raise ValueError(f"{path}: {name}: expected one positive number, got {value}")
+    if value.size != 1 or value.dtype.kind not in "fiu" or value.item() not in domain:
+        raise ValueError(f"{path}: {name}: expected {domain.words}, got {value}")
     return float(value.item())
 
 

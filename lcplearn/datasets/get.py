@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lcplearn.datasets import contactnets, cube_tosses, push_logs, pushes
+from lcplearn.datasets import contactnets, cube_slides, cube_tosses, push_logs, pushes
+from lcplearn.datasets.files import replace
 
 Arrays = Mapping[str, NDArray]
 
@@ -92,19 +93,16 @@ def make(source: Source, clone: Path, out: Path) -> dict[str, Path]:
             f"{clone}: expected the recordings of commit {source.commit[:7]} (checksum {source.digest[:12]}), "
             f"got others ({found[:12]}); nothing was written"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    paths = {}
-    for name, arrays in files.items():
-        beside = out / f".{name}.part.npz"
-        np.savez_compressed(beside, **arrays)  # type: ignore[arg-type]  # numpy types **arrays as flags
-        os.replace(beside, out / name)
-        paths[name] = out / name
+    paths = {name: out / name for name in files}
+    for name, path in paths.items():
+        # numpy types **arrays as flags
+        replace(path, lambda file, arrays=files[name]: np.savez_compressed(file, **arrays))  # type: ignore[misc]
     return paths
 
 
 def _convert_tosses(clone: Path) -> Mapping[str, Arrays]:
     tosses, slides = contactnets.convert(clone / CONTACT_NETS.folder)
-    return {contactnets.TOSSES_FILE: tosses, contactnets.SLIDES_FILE: slides}
+    return {contactnets.TOSSES_FILE: tosses, cube_slides.FILE: slides}
 
 
 def _checked_tosses(files: Mapping[str, Arrays]) -> bytes:
@@ -150,7 +148,7 @@ MLAB_EXP = Source(
     checked=_checked_pushes,
 )
 FILES = {
-    "slides": (contactnets.SLIDES_FILE, CONTACT_NETS),
+    "slides": (cube_slides.FILE, CONTACT_NETS),
     "tosses": (contactnets.TOSSES_FILE, CONTACT_NETS),
     "pushes": (pushes.FILE, MLAB_EXP),
 }

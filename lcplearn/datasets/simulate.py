@@ -1,12 +1,12 @@
 """Simulated recordings: nothing to download, and the truth is known."""
 
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
-from lcplearn.datasets.recordings import Recordings
+from lcplearn.datasets.simulated import splits
 from lcplearn.datasets.task import Task
 from lcplearn.domains import NOT_NEGATIVE, SHARE, check
 from lcplearn.scenes.falling_block import FallingBlock
@@ -16,16 +16,7 @@ from lcplearn.scenes.space import LINE
 
 FrictionLabels = Literal["physical", "lcp", "slack", "measured_slack"]
 
-_SPLITS = ("train", "validation", "test", "test_long")
 _FORCE_PER_LIMIT = 1.2  # standard deviation of the force over mu m g: the block rests 34-60 % of the time
-
-
-class _Draws(NamedTuple):
-    """Random numbers of one split, before any physical scale."""
-
-    start: Float[Tensor, " N"]
-    force: Float[Tensor, "N T"]
-    noise: Float[Tensor, "N T+1"]
 
 
 def simulate_sliding_block(
@@ -87,30 +78,26 @@ def simulate_sliding_block(
     Raises:
         ValueError: An argument is out of range.
     """
-    sizes = [(trajectories, length), (validation_trajectories, length)]
-    sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
-    _check_sizes(sizes)
     check(NOT_NEGATIVE, noise=noise, force_std=force_std, jitter=jitter, initial_speed=initial_speed)
     check(SHARE, switch_probability=switch_probability, share_from_rest=share_from_rest)
     if friction is not None and friction not in get_args(FrictionLabels):
         raise ValueError(f"friction: expected one of {', '.join(get_args(FrictionLabels))}, got {friction!r}")
     block = SlidingBlock(mass=mass, mu=mu, dt=dt, gravity=gravity)
-    draws = []
-    for split, (count, steps) in enumerate(sizes):
-        draw = _draw(_generator(seed, split), count, steps, switch_probability, jitter)
-        moving = torch.arange(count) >= round(share_from_rest * count)
-        draws.append(draw._replace(start=draw.start * initial_speed * moving))
-    force_std = _force_std(block, draws[0], force_std, share_at_rest)
+    sizes = {"train": (trajectories, length), "validation": (validation_trajectories, length)}
+    sizes |= {"test": (test_trajectories, test_length), "test_long": (long_trajectories, long_length)}
     recordings: dict[str, Any] = {}
-    for name, draw in zip(_SPLITS, draws, strict=True):
-        forces = force_std * draw.force
-        velocities = _slide(block, draw.start, forces)
-        measured = velocities + (noise if name in ("train", "validation") else 0.0) * draw.noise
+    for split in splits(seed, sizes):
+        levels = split.levels(1, switch_probability) + jitter * split.normal(split.steps, 1)
+        moving = torch.arange(split.count) >= round(share_from_rest * split.count)
+        start = split.normal(1)[:, 0] * initial_speed * moving
+        if split.name == "train":  # the first
+            std = _force_std(block, start, levels[..., 0], force_std, share_at_rest)
+        forces = std * levels
+        velocities = _slide(block, start, forces[..., 0])
+        labels = None if friction is None else friction_labels(block, velocities[:, :-1], forces[..., 0], friction)
         moved = torch.nn.functional.pad(dt * velocities[:, 1:].cumsum(dim=1), (1, 0))
-        labels = None if friction is None else friction_labels(block, velocities[:, :-1], forces, friction)
-        drive = Drive(forces.unsqueeze(-1), labels)
-        true = torch.stack((moved, velocities), dim=-1)
-        recordings[name] = Recordings(torch.stack((moved, measured), dim=-1), drive, _full_length(forces), true)
+        states = torch.stack((moved, velocities), dim=-1)
+        recordings[split.name] = split.recordings(states, Drive(forces, labels), noise, 1)
     given, truth = {"gravity": gravity}, {"mu": mu, "mass": mass}
     return Task("sliding_block", LINE, dt, **recordings, given=given, truth=truth, scene=block)
 
@@ -156,10 +143,6 @@ def simulate_falling_block(
     seed: int = 0,
     trajectories: int = 40,
     length: int = 50,
-    validation_trajectories: int = 10,
-    test_trajectories: int = 40,
-    test_length: int = 50,
-    long_trajectories: int = 20,
     long_length: int = 200,
     dt: float = 0.02,
     mass: float = 1.0,
@@ -175,13 +158,9 @@ def simulate_falling_block(
 
     Args:
         seed: Seed; the splits draw independently.
-        trajectories: Training trajectories.
-        length: Steps of a training or validation trajectory.
-        validation_trajectories: Validation trajectories.
-        test_trajectories: Trajectories for one-step errors.
-        test_length: Steps of each of them.
-        long_trajectories: Trajectories for long rollouts.
-        long_length: Steps of each of them.
+        trajectories: Training trajectories; as many test, a quarter of that validates, half of that is long.
+        length: Steps of each but the long ones.
+        long_length: Steps of these.
         dt: Step size [s]; > 0.
         mass: Mass [kg]; > 0.
         gravity: Gravitational acceleration [m/s^2].
@@ -195,42 +174,18 @@ def simulate_falling_block(
     Raises:
         ValueError: An argument is out of range.
     """
-    sizes = [(trajectories, length), (validation_trajectories, length)]
-    sizes += [(test_trajectories, test_length), (long_trajectories, long_length)]
-    _check_sizes(sizes)
     check(NOT_NEGATIVE, noise=noise, initial_height=initial_height, initial_speed=initial_speed)
     block = FallingBlock(mass=mass, dt=dt, gravity=gravity)
+    sizes = {"train": (trajectories, length), "validation": (max(1, trajectories // 4), length)}
+    sizes |= {"test": (trajectories, length), "test_long": (max(1, trajectories // 2), long_length)}
     recordings: dict[str, Any] = {}
-    for split, (name, (count, steps)) in enumerate(zip(_SPLITS, sizes, strict=True)):
-        generator = _generator(seed, split)
-        height = initial_height * torch.rand(count, generator=generator, dtype=torch.float64)
-        speed = initial_speed * torch.randn(count, generator=generator, dtype=torch.float64)
-        drive = Drive(torch.zeros(count, steps, 1, dtype=torch.float64))
-        path = block.rollout(torch.stack((height, speed), dim=-1), drive.force)
-        error = torch.randn(path.velocities.shape[:-1], generator=generator, dtype=torch.float64).unsqueeze(-1)
-        measured = path.velocities + (noise if name in ("train", "validation") else 0.0) * error
-        true = torch.cat((path.positions, path.velocities), dim=-1)
-        states = torch.cat((path.positions, measured), dim=-1)
-        recordings[name] = Recordings(states, drive, _full_length(drive.force), true)
+    for split in splits(seed, sizes):
+        start = torch.stack((initial_height * split.uniform(), initial_speed * split.normal()), dim=-1)
+        drive = Drive(torch.zeros(split.count, split.steps, 1, dtype=torch.float64))
+        path = block.rollout(start, drive.force)
+        recordings[split.name] = split.recordings(path.states, drive, noise, 1)
     given = {"gravity": gravity}
-    return Task("falling_block", LINE, dt, **recordings, given=given, truth={"mass": mass}, scene=block)
-
-
-def _generator(seed: int, split: int) -> Generator:
-    return torch.Generator().manual_seed(len(_SPLITS) * seed + split)
-
-
-def _draw(generator: Generator, count: int, steps: int, switch_probability: float, jitter: float) -> _Draws:
-    def normal(columns: int) -> Tensor:
-        return torch.randn(count, columns, generator=generator, dtype=torch.float64)
-
-    levels = normal(steps)
-    switch = torch.rand(count, steps, generator=generator, dtype=torch.float64) < switch_probability
-    switch[:, 0] = True
-    # each step takes the level drawn at the last switch before it
-    last = torch.where(switch, torch.arange(steps), 0).cummax(dim=1).values
-    force = levels.gather(1, last) + jitter * normal(steps)
-    return _Draws(start=normal(1)[:, 0], force=force, noise=normal(steps + 1))
+    return Task("falling_block", LINE, dt, **recordings, given=given, truth={"mass": mass}, scene=block, positions=True)
 
 
 def _slide(block: SlidingBlock, start: Float[Tensor, " N"], forces: Float[Tensor, "N T"]) -> Float[Tensor, "N T+1"]:
@@ -240,7 +195,9 @@ def _slide(block: SlidingBlock, start: Float[Tensor, " N"], forces: Float[Tensor
     return torch.stack(velocities, dim=1)
 
 
-def _force_std(block: SlidingBlock, draws: _Draws, force_std: float | None, share_at_rest: float | None) -> float:
+def _force_std(
+    block: SlidingBlock, start: Tensor, levels: Tensor, force_std: float | None, share_at_rest: float | None
+) -> float:
     limit = float(block.mu * block.mass * block.gravity)
     if share_at_rest is None:
         if force_std is None and limit == 0:
@@ -254,16 +211,6 @@ def _force_std(block: SlidingBlock, draws: _Draws, force_std: float | None, shar
     low, high = -3.0, 3.0  # log10(force_std / limit): always at rest in the end, never at rest
     for _ in range(30):
         middle = (low + high) / 2
-        at_rest = _slide(block, draws.start, limit * 10**middle * draws.force)[:, 1:] == 0
+        at_rest = _slide(block, start, limit * 10**middle * levels)[:, 1:] == 0
         low, high = (middle, high) if at_rest.double().mean() > share_at_rest else (low, middle)
     return limit * 10**low
-
-
-def _check_sizes(sizes: list[tuple[int, int]]) -> None:
-    for name, (count, steps) in zip(_SPLITS, sizes, strict=True):
-        if count < 1 or steps < 1:
-            raise ValueError(f"{name}: expected at least 1 trajectory of 1 step, got {count} of {steps}")
-
-
-def _full_length(forces: Tensor) -> Tensor:
-    return torch.full((forces.shape[0],), forces.shape[1])

@@ -5,15 +5,13 @@ from typing import Any
 
 import torch
 
-from lcplearn.datasets.recordings import Recordings
+from lcplearn.datasets.simulated import splits
 from lcplearn.datasets.task import Task
 from lcplearn.domains import NOT_NEGATIVE, check
 from lcplearn.scenes.planar_block import PlanarBlock
 from lcplearn.scenes.planar_body import PlanarBody, rectangle, turned
 from lcplearn.scenes.scene import Drive, rollout
 from lcplearn.scenes.space import PLANE, TABLE
-
-_SPLITS = ("train", "validation", "test", "test_long")
 
 
 def simulate_planar_block(
@@ -56,20 +54,15 @@ def simulate_planar_block(
     """
     check(NOT_NEGATIVE, noise=noise)
     block = PlanarBlock(mass=mass, mu=mu, dt=dt, gravity=gravity)
-    counts = (trajectories, max(trajectories // 2, 1), test_trajectories, long_trajectories)
+    sizes = {"train": (trajectories, length), "validation": (max(trajectories // 2, 1), length)}
+    sizes |= {"test": (test_trajectories, length), "test_long": (long_trajectories, long_length)}
     recordings: dict[str, Any] = {}
-    for split, (name, count) in enumerate(zip(_SPLITS, counts, strict=True)):
-        draw = torch.Generator().manual_seed(len(_SPLITS) * seed + split)
-        steps = long_length if name == "test_long" else length
-        levels = torch.randn(count, steps, 2, generator=draw, dtype=torch.float64)
-        switch = torch.rand(count, steps, generator=draw, dtype=torch.float64) < switch_probability
-        switch[:, 0] = True
-        last = torch.where(switch, torch.arange(steps), 0).cummax(dim=1).values
-        force = 1.2 * mu * mass * gravity * levels.gather(1, last.unsqueeze(-1).expand(-1, -1, 2))
-        start = torch.randn(count, 2, generator=draw, dtype=torch.float64)
-        start[: count // 2] = 0.0
-        path = rollout(block, torch.cat((torch.zeros_like(start), start), dim=-1), Drive(force))
-        recordings[name] = _measured(path.positions, path.velocities, Drive(force), noise, name, draw)
+    for split in splits(seed, sizes):
+        drive = Drive(1.2 * mu * mass * gravity * split.levels(2, switch_probability))
+        start = split.normal(2)
+        start[: split.count // 2] = 0.0
+        path = rollout(block, torch.cat((torch.zeros_like(start), start), dim=-1), drive)
+        recordings[split.name] = split.recordings(path.states, drive, noise, 2)
     given, truth = {"gravity": gravity}, {"mu": mu, "mass": mass}
     return Task("planar_block", TABLE, dt, **recordings, given=given, truth=truth, scene=block)
 
@@ -113,35 +106,19 @@ def simulate_planar_body(
     body = PlanarBody(
         corners=corners, inertia=inertia, mu=mu, dt=dt, mass=mass, restitution=restitution, gravity=gravity
     )
-    counts = (trajectories, max(trajectories // 2, 1), trajectories, trajectories)
+    sizes = dict.fromkeys(("train", "validation", "test", "test_long"), (trajectories, length))
+    sizes["validation"] = (max(trajectories // 2, 1), length)
+    scale = torch.tensor([1.0, 1.0, 1.0 / half_width], dtype=torch.float64)
     recordings: dict[str, Any] = {}
-    for split, (name, count) in enumerate(zip(_SPLITS, counts, strict=True)):
-        draw = torch.Generator().manual_seed(len(_SPLITS) * seed + split)
-        uniform = torch.rand(count, 2, generator=draw, dtype=torch.float64)
+    for split in splits(seed, sizes):
+        uniform = split.uniform(2)
         angle = 2.0 * math.pi * uniform[:, 0]
         low = turned(corners, angle)[..., 1].amin(-1)
-        position = torch.stack((torch.zeros(count, dtype=torch.float64), 0.05 * uniform[:, 1] - low, angle), dim=-1)
-        velocity = torch.randn(count, 3, generator=draw, dtype=torch.float64) * torch.tensor([1.0, 0.5, 8.0])
-        drive = Drive(torch.zeros(count, length, 3, dtype=torch.float64))
+        position = torch.stack((torch.zeros_like(angle), 0.05 * uniform[:, 1] - low, angle), dim=-1)
+        velocity = split.normal(3) * torch.tensor([1.0, 0.5, 8.0])
+        drive = Drive(torch.zeros(split.count, length, 3, dtype=torch.float64))
         path = rollout(body, torch.cat((position, velocity), dim=-1), drive)
-        scale = torch.tensor([1.0, 1.0, 1.0 / half_width], dtype=torch.float64)
-        recordings[name] = _measured(path.positions, path.velocities, drive, noise * scale, name, draw)
+        recordings[split.name] = split.recordings(path.states, drive, noise * scale, 3)
     given = {"gravity": gravity, "mass": mass, "corners": corners.tolist()}
     truth = {"mu": mu, "inertia": inertia, "restitution": restitution}
-    return Task("planar_body", PLANE, dt, **recordings, given=given, truth=truth, scene=body)
-
-
-def _measured(
-    positions: torch.Tensor,
-    velocities: torch.Tensor,
-    drive: Drive,
-    noise: float | torch.Tensor,
-    name: str,
-    draw: torch.Generator,
-) -> Recordings:
-    """Recordings whose velocities have noise, except in test and test_long."""
-    error = torch.randn(velocities.shape, generator=draw, dtype=torch.float64)
-    measured = velocities + (noise if name in ("train", "validation") else 0.0) * error
-    steps = torch.full((len(positions),), positions.shape[1] - 1)
-    true = torch.cat((positions, velocities), dim=-1)
-    return Recordings(torch.cat((positions, measured), dim=-1), drive, steps, true)
+    return Task("planar_body", PLANE, dt, **recordings, given=given, truth=truth, scene=body, positions=True)

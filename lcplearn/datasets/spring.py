@@ -4,9 +4,9 @@ from typing import Any
 
 import torch
 
-from lcplearn.datasets.recordings import Recordings
+from lcplearn.datasets.simulated import splits
 from lcplearn.datasets.task import Task
-from lcplearn.domains import NOT_NEGATIVE, POSITIVE, check
+from lcplearn.domains import NOT_NEGATIVE, check
 from lcplearn.scenes.scene import Drive
 from lcplearn.scenes.spring_block import SpringBlock
 
@@ -48,22 +48,16 @@ def simulate_spring_block(
     Raises:
         ValueError: An argument is out of range.
     """
-    check(POSITIVE, trajectories=trajectories, length=length, long_length=long_length)
     check(NOT_NEGATIVE, noise=noise, initial_stretch=initial_stretch, force_std=force_std)
     block = SpringBlock(mass=mass, mu=mu, stiffness=stiffness, dt=dt, gravity=gravity)
     sizes = {"train": (trajectories, length), "validation": (max(1, trajectories // 4), length)}
     sizes |= {"test": (2 * trajectories, length), "test_long": (10, long_length)}
-    parts: dict[str, Any] = {}
-    for split, (name, (count, steps)) in enumerate(sizes.items()):
-        generator = torch.Generator().manual_seed(len(sizes) * seed + split)
-        start = torch.randn(count, 2, generator=generator, dtype=torch.float64)
-        start *= torch.tensor([initial_stretch, 0.0], dtype=torch.float64)
-        levels = force_std * torch.randn(count, -(-steps // 10), 1, generator=generator, dtype=torch.float64)
-        drive = Drive(levels.repeat_interleave(10, dim=1)[:, :steps])
+    recordings: dict[str, Any] = {}
+    for split in splits(seed, sizes):
+        start = split.normal(2) * torch.tensor([initial_stretch, 0.0], dtype=torch.float64)
+        levels = force_std * split.normal(-(-split.steps // 10), 1)
+        drive = Drive(levels.repeat_interleave(10, dim=1)[:, : split.steps])
         path = block.rollout(start, drive.force)
-        true = torch.cat((path.positions, path.velocities), dim=-1)
-        error = noise * torch.randn(true.shape, generator=generator, dtype=torch.float64)
-        measured = true if name.startswith("test") else true + error
-        parts[name] = Recordings(measured, drive, torch.full((count,), steps), true)
+        recordings[split.name] = split.recordings(path.states, drive, noise, 2)
     given, truth = {"mass": mass, "gravity": gravity}, {"stiffness": stiffness, "mu": mu}
-    return Task("spring_block", block.space, dt, **parts, given=given, truth=truth, scene=block)
+    return Task("spring_block", block.space, dt, **recordings, given=given, truth=truth, scene=block, positions=True)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lcplearn.datasets.files import positive_number, read_npz
+from lcplearn.datasets.files import number, positive_number, read_npz
 from lcplearn.datasets.recordings import Recordings
 from lcplearn.domains import positive
 from lcplearn.scenes.scene import Drive, Scene
@@ -36,6 +36,7 @@ class Task:
         scene: What made the recordings; None if they are not simulated.
         chosen_by: What the best model of a training is chosen by, on the validation recordings: "rollout", its velocity
             error over windows, or "pose", its pose error over whole recordings.
+        positions: Whether velocities change with positions, so that models without contact structure should see them.
 
     Raises:
         ValueError: A shape doesn't fit the space, recordings have no step, or dt is not positive.
@@ -53,6 +54,7 @@ class Task:
     judged_by: tuple[str, ...] = MOTION
     scene: Scene | None = None
     chosen_by: str = "rollout"
+    positions: bool = False
 
     def __post_init__(self) -> None:
         positive("dt", self.dt)
@@ -94,6 +96,7 @@ def check_recordings(name: str, part: Recordings, space: Space) -> None:
     for field_name, tensor, _ in shapes:
         if field_name in masks and tensor is not None and not bool(tensor[masks[field_name]].isfinite().all()):
             raise ValueError(f"{name}.{field_name}: expected finite numbers, got NaN or infinity")
+    space.normalised(states[known], f"{name}.states")  # refuses what is no rotation
 
 
 def read_recordings(
@@ -154,7 +157,7 @@ def read_recordings(
         test=everything,
         test_long=everything,
         given={"gravity": 9.81} if given is None else given,
-        truth={name: positive_number(path, name, arrays[name]) for name in truth if name in arrays},
+        truth={name: number(path, name, arrays[name]) for name in truth if name in arrays},
     )
 
 

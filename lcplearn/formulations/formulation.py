@@ -150,7 +150,7 @@ class Formulation(nn.Module):
 
 
 def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
-    """Build a model for a task: its space, dt and what is given come from the task, as far as the model asks for them.
+    """Build a model for a task, which tells space, dt, what is given and whether positions matter to those that ask.
 
     Args:
         cls: Class of the model.
@@ -162,6 +162,7 @@ def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
         "space": task.space,
         "dt": task.dt,
         "given": dict(task.given),
+        "positions": task.positions,
     }
     asked = inspect.signature(cls.__init__).parameters
     return cls(**{name: value for name, value in known.items() if name in asked and value is not None} | arguments)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from lcplearn.datasets.recordings import Windows
 from lcplearn.domains import Domain
 from lcplearn.formulations.formulation import Formulation
+from lcplearn.formulations.line.formulation import path_error, step_error
 from lcplearn.scenes.scene import Drive, Scene, Step
 from lcplearn.scenes.sliding_block import SlidingBlock
 
@@ -78,7 +79,11 @@ class Identified(Formulation):
 
     def numbers(self) -> dict[str, Tensor]:
         """The learned numbers, differentiable."""
-        return {name: _bound(self.free[name], domain) for name, domain in self.domains.items()}
+        return self.bound({name: self.free[name] for name in self.domains})
+
+    def bound(self, free: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The numbers that free parameters, which may be any number, stand for."""
+        return {name: _bound(free[name], domain) for name, domain in self.domains.items()}
 
     def moving(self) -> Scene:
         numbers: dict[str, Any] = {**self.fixed, **self.numbers()}
@@ -95,10 +100,9 @@ class Identified(Formulation):
         if free.requires_grad:
             free.register_hook(lambda gradients: clip_rows(gradients, self.clip))
         parts = free.split([self.free[name].numel() for name in self.domains], dim=-1)
-        numbers = {
-            name: _bound(part.reshape(count, *self.free[name].shape), domain)
-            for (name, domain), part in zip(self.domains.items(), parts, strict=True)
-        }
+        numbers = self.bound(
+            {name: part.reshape(count, *self.free[name].shape) for name, part in zip(self.domains, parts, strict=True)}
+        )
         scene: Scene = self.scene_type(dt=self.dt, **{**self.fixed, **numbers})
         return scene
 
@@ -151,6 +155,16 @@ class Physical(Identified):
         # A mass that is not learned is for data without force, where it has no effect: they may have another.
         self.given = {"gravity": gravity}
         self.register_load_state_dict_pre_hook(_rename)
+
+    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
+        return step_error(self._next_velocity(), windows)
+
+    def rollout_error(self, windows: Windows) -> Float[Tensor, "B k"]:
+        return path_error(self._next_velocity(), windows)
+
+    def _next_velocity(self) -> Callable[..., Tensor]:
+        block: Any = self.moving()
+        return lambda velocity, force, friction: block.next_velocity(velocity, force)
 
 
 def _rename(module: nn.Module, state: dict[str, Any], prefix: str, *others: Any) -> None:

@@ -46,8 +46,9 @@ class LCPSolution(NamedTuple):
     A NamedTuple, because `torch.func.vmap` accepts one as a return value.
 
     Attributes:
-        z, w: The complementary pair; exact zeros off and on `basis`. Best iterate where not SOLVED, NaN for
-            NONFINITE_INPUT. With `smoothing` both are positive.
+        z: The solution; exact zeros off `basis`. Best iterate where not SOLVED, NaN for NONFINITE_INPUT. With
+            `smoothing` z and w are positive.
+        w: M z + q; exact zeros on `basis`.
         basis: The solver's final basis: True where w_i = 0 is imposed. z_i may be zero there (degenerate).
         status: `Status` value of each element.
         residual: What `status` was judged by (see `residuals.py`), float64, before rounding to the caller's dtype.

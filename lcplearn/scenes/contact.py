@@ -12,20 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lcplearn.lcp.methods import pivoting_kernel
-from lcplearn.lcp.torch_internals import traced
-from lcplearn.scenes.contact_gradient import attach_gradient
-from lcplearn.scenes.friction_lcp import (
-    DEAD_ZONE,
-    FULL_RANK,
-    MAX_ITERATIONS,
-    ROUNDING,
-    SETTLED,
-    Answer,
-    Problem,
-    cone_lcp,
-    frictionless_lcp,
-    polygon_lcp,
-)
+from lcplearn.lcp.torch_internals import traced, transformed
+from lcplearn.scenes.contact_solve import solve
+from lcplearn.scenes.friction_lcp import Problem
 from lcplearn.scenes.scene import Mode
 
 RestitutionLaw = Literal["newton", "continuous"]
@@ -150,35 +139,24 @@ def contact_step(
     Source: Stewart and Trinkle 1996 (time stepping); NOTES 5.7 (cone, gradient, rest).
     """
     problem, batch = _flatten(contacts, free, mass, dt)
-    with torch.no_grad():
-        kernel = None if polygon is not None else compiled_contacts(free.device)
-        if kernel is None:
-            found, at_rest = find(problem, polygon, rest)
-        else:
-            found, at_rest = kernel.solve(problem, rest)
-    answer = found
-    if torch.is_grad_enabled() and any(x.requires_grad for x in problem):
-        if polygon is not None:
-            answer = _polygon_gradient(problem, found, polygon)
-        else:
-            loaded = found.normal > 0.0
-            answer = attach_gradient(problem, found, _buckets(loaded, loaded.any(-1)))
+    kernel = None if polygon is not None else compiled_contacts(free.device)
+    found, at_rest = solve(problem, polygon, rest) if kernel is None else kernel.solve(problem, rest)
     # The value is exactly 0, and the gradient that of the computed velocity.
-    velocity = torch.where(at_rest.unsqueeze(-1), answer.velocity - answer.velocity.detach(), answer.velocity)
+    velocity = torch.where(at_rest.unsqueeze(-1), found.velocity - found.velocity.detach(), found.velocity)
     slips = torch.where(found.sticks | at_rest.unsqueeze(-1), int(Mode.STICK), int(Mode.SLIP))
     mode = torch.where(found.normal > 0.0, slips, int(Mode.SEPARATION))
-    numbers = (x.to(free.dtype) for x in (velocity, answer.normal, answer.friction))
+    numbers = (x.to(free.dtype) for x in (velocity, found.normal, found.friction))
     parts = (*numbers, mode, at_rest, found.solved, found.settled)
     return ContactStep(*(x.reshape((*batch, *x.shape[1:])) for x in parts))
 
 
 def compiled_contacts(device: torch.device) -> ModuleType | None:
-    """`contact_kernel`, imported on first use; None off the CPU, without numba and where a tracer looks on."""
-    if device.type != "cpu" or traced() or pivoting_kernel() is None:
+    """`contact_kernel.steps`, imported on first use; None off the CPU, without numba and where a tracer looks on."""
+    if device.type != "cpu" or traced() or transformed() or pivoting_kernel() is None:
         return None
-    from lcplearn.scenes import contact_kernel
+    from lcplearn.scenes.contact_kernel import steps
 
-    return contact_kernel
+    return steps
 
 
 def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple[Problem, torch.Size]:
@@ -203,104 +181,3 @@ def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple
         ),
         batch,
     )
-
-
-def find(problem: Problem, polygon: int | None, rest: bool) -> tuple[Answer, Tensor]:
-    """Solve with rows for the contacts that close alone, then for those it was wrong about; and where it is at rest.
-
-    Elements with equally many rows go together.
-    """
-    answer = Answer.free_flight(problem)
-    tolerance = ROUNDING * problem.speed_scale()
-    new = problem.excess(problem.free) < 0.0
-    active = new
-    while (todo := new.any(-1)).any():
-        for elements, rows in _buckets(active, todo):
-            part = problem.pick(elements, rows)
-            found = _iterate(part) if part.directions == 2 and polygon is None else _once(part, polygon)
-            answer.put(elements, rows, found)
-        new = (problem.excess(answer.velocity) < -tolerance) & ~active
-        active = active | new
-    answer = answer._replace(solved=answer.solved & problem.excess(answer.velocity).isfinite().all(-1))
-    return answer, _at_rest(problem, answer) if rest else torch.zeros_like(answer.solved)
-
-
-def _buckets(active: Tensor, todo: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Elements [b] with equally many active contacts, and these contacts [b, K], for each number K > 0."""
-    counts = torch.where(todo, active.sum(-1), 0)
-    result = []
-    for count in counts.unique().tolist():
-        if count:
-            elements = torch.nonzero(counts == count)[:, 0]
-            rows = torch.nonzero(active[elements])[:, 1].reshape(-1, count)
-            result.append((elements, rows))
-    return result
-
-
-def _once(part: Problem, polygon: int | None) -> Answer:
-    """One LCP, for what needs no fixed point."""
-    if part.directions == 0:
-        return frictionless_lcp(part)
-    if polygon is not None and part.directions == 2:
-        return polygon_lcp(part, polygon)
-    return cone_lcp(part, None)
-
-
-def _iterate(part: Problem) -> Answer:
-    """Newton's iteration for the cone; elements leave when they have settled."""
-    guess = Answer.guess(part)
-    result, todo = guess.clone(), torch.arange(len(part.free), device=part.free.device)
-    scale = part.mass_norm(part.free)
-    old, was_damped = torch.full_like(scale, torch.inf), torch.zeros_like(guess.solved)
-    for iteration in range(MAX_ITERATIONS):
-        new = cone_lcp(part, guess)
-        change = part.mass_norm(new.velocity - guess.velocity)
-        new = new._replace(settled=change <= SETTLED * (scale + part.mass_norm(new.velocity)))
-        result.put(todo, None, new)
-        going = torch.nonzero(~(new.settled & new.solved))[:, 0]
-        if not len(going):
-            break
-        # A step in two at most is halved, against cycles: always halved, the iterates would converge no faster.
-        damped = (change > 0.3 * old) & (iteration > 3) & ~was_damped
-        guess = guess.toward(new, torch.where(damped, 0.5, 1.0)).pick(going)
-        part, todo, scale = part.pick(going), todo[going], scale[going]
-        old, was_damped = change[going], damped[going]
-    return result
-
-
-def _polygon_gradient(problem: Problem, found: Answer, polygon: int) -> Answer:
-    """The same answer with its gradient, that of the LCP of the contacts that are loaded."""
-    velocity, normal, friction = problem.free, torch.zeros_like(found.normal), torch.zeros_like(found.friction)
-    loaded = found.normal > 0.0
-    for elements, rows in _buckets(loaded, loaded.any(-1)):
-        part = _once(problem.pick(elements, rows), polygon)
-        velocity = velocity.index_put((elements,), part.velocity)
-        place = (elements.unsqueeze(-1), rows)
-        normal, friction = normal.index_put(place, part.normal), friction.index_put(place, part.friction)
-    return found._replace(velocity=velocity, normal=normal, friction=friction)
-
-
-def _at_rest(problem: Problem, found: Answer) -> Tensor:
-    """Where contacts leave no velocity but 0: the rows that hold it have full rank.
-
-    A loaded contact that sticks holds all its directions, one that only touches (redundant corners) holds its normal.
-    Where contacts are compliant a normal speed within what the whole load would let a contact sink counts as none: else
-    the load would go on moving from corner to corner.
-    """
-    nv, directions = problem.free.shape[-1], problem.directions
-    normal_speed = (problem.normal @ found.velocity.unsqueeze(-1)).squeeze(-1)
-    limit = DEAD_ZONE * problem.speed_scale() + problem.compliance * found.normal.sum(-1, keepdim=True)
-    touches = (normal_speed.abs() <= limit) & (problem.excess(found.velocity) <= limit)
-    holds = touches & (found.normal > 0.0) & found.sticks
-    result = found.solved & found.settled & (touches.sum(-1) + directions * holds.sum(-1) >= nv)
-    elements = torch.nonzero(result)[:, 0]
-    if directions == 0 or not len(elements):
-        return result & (directions > 0)
-    kept = torch.cat((touches.unsqueeze(-1), holds.unsqueeze(-1).expand(*holds.shape, directions)), dim=-1)[elements]
-    rows = torch.cat((problem.normal.unsqueeze(-2), problem.tangents), dim=-2)[elements]
-    rows = (rows * kept.unsqueeze(-1) / problem.mass[elements].sqrt()[:, None, None]).flatten(1, 2)
-    gram = rows.mT @ rows
-    shift = FULL_RANK * gram.diagonal(dim1=-2, dim2=-1).amax(-1)
-    identity = torch.eye(nv, dtype=gram.dtype, device=gram.device)
-    result[elements] = torch.linalg.cholesky_ex(gram - shift[:, None, None] * identity).info == 0
-    return result

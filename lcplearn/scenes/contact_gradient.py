@@ -16,7 +16,7 @@ Source: implicit function theorem; NOTES 5.7.
 import torch
 from torch import Tensor
 
-from lcplearn.scenes.friction_lcp import CREEP, Answer, Problem
+from lcplearn.scenes.friction_lcp import CREEPS, Answer, Problem
 from lcplearn.scenes.numbers import matvec
 
 RANK = 1e-10  # singular values below this share of the largest are those of redundant contacts
@@ -56,7 +56,7 @@ def _newton_step(part: Problem, found: Answer) -> tuple[Tensor, Tensor, Tensor]:
     slip = speed[..., 1:]
     with torch.no_grad():
         size = torch.linalg.vector_norm(slip, dim=-1)
-        sticks = found.sticks | (size <= 10.0 * CREEP * part.speed_scale())
+        sticks = found.sticks | (size <= CREEPS * part.speed_scale())
         slips = ~sticks.unsqueeze(-1)
         # in units of speed, like the other rows
         unit = (part.normal.square() / part.mass.unsqueeze(-2)).sum(-1, keepdim=True)

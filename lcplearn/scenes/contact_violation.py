@@ -10,7 +10,8 @@ from lcplearn.lcp.solve import solve_lcp
 
 DIRECTIONS = 4  # of friction, the first along the recorded slip
 NEAREST = 4  # contacts that are considered, those of least gap
-WEIGHT = 0.03  # of the three costs beside the residual; larger ones let the shape give way instead of the impulses
+WEIGHT = 0.03  # of the costs of impulses; larger ones let the shape give way instead of the impulses
+DEPTH_WEIGHT = 1e-3  # of overlap, which noise of measured poses makes: more of it shrinks the shape
 SOFTENING = 1e-3  # of the impulses, relative to 1 / mass: makes the minimiser unique
 
 
@@ -44,7 +45,7 @@ def contact_violation(
     the inverse inertia, phi and u gap and slip after the step, impulses lambda in the friction cone, per unit of mass:
 
         min 1/2 |d - W J' lambda|^2_G + k sum_i [lambda_n max(phi, 0) / dt + mu lambda_n |u| + lambda_t . u]
-            + k sum_i max(0, -phi)^2 / dt^2
+            + k_depth sum_i max(0, -phi)^2 / dt^2
 
     The impulses should explain d, act where there is contact, oppose the slip with all that is allowed; and the
     recorded body should not be in the ground. The added terms are linear in the impulses and at least 0 in the cone:
@@ -85,7 +86,7 @@ def contact_violation(
         + 0.5 * SOFTENING * impulse.square().sum((-2, -1))
         + (impulse * cost).sum((-2, -1))
         + (multiplier * beyond_cone).sum(-1)
-        + WEIGHT * (torch.relu(-touch.gap) / dt).square().sum(-1)
+        + DEPTH_WEIGHT * (torch.relu(-touch.gap) / dt).square().sum(-1)
     )
     return torch.where(solved, value, 0.0)
 

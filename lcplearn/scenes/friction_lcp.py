@@ -4,7 +4,7 @@
 
     |f_t| <= mu lambda,     f_s = -weight v_s,     weight = mu lambda / |slip|,
 
-with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is a few times `CREEP`, t is
+with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is below `CREEPS`, t is
 along the friction force, and the slip in the weight is at least `CREEP`. At the fixed point v_s = 0 (slip) or f_s = 0
 (stick), so that this is Coulomb's law, and its derivative: what changes the weight multiplies v_s = 0.
 
@@ -15,6 +15,15 @@ f_s is condensed out of the Delassus matrix A = J mass^-1 J', and the facets mak
     0 <= sigma  ⟂ 2 mu lambda - a >= 0
 
 so that v_t = w_a - sigma is read from complementary variables, and is 0 to the last bit at stick.
+
+Where contacts are redundant the loads that solve an LCP are many, and from one iterate to the next another contact
+carries them. An iteration that has not settled after `PLAIN` LCPs goes on with a proximal term: the compliance grows
+by p = `PROXIMAL` / (n mass^-1 n'), the target by p times the load of the iterate before. What it settles at solves the
+same law.
+
+Corners of a body that comes to rest may contradict each other: none may slip, yet each moves up or down at its own
+speed of 1e-6 and less, and turns the body by it. Then they creep, as a slip of `CREEP` stands for none, and friction
+grows from LCP to LCP. After `PATIENCE` of them a velocity that stays counts as settled if the law holds to `CRUDE`.
 
 Source: NOTES 5.7; the rows of a polygon: Stewart and Trinkle 1996.
 """
@@ -28,12 +37,18 @@ from torch import Tensor
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.numbers import matvec
 
-MAX_ITERATIONS = 40  # of the cone's fixed point; the mean is about 3
-SETTLED = 1e-10  # change of velocity from one iterate to the next, relative to the free velocity, in the mass norm
+MAX_ITERATIONS = 60  # of the cone's fixed point; the mean is about 2.5
+PLAIN = 12  # of them before the proximal term
+PROXIMAL = 0.1
+SETTLED = 3e-14  # violation of the law as a speed, relative to that of free flight and to what the load can cause
 DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
 FULL_RANK = 1e-6  # smallest eigenvalue of the rows that hold a body at rest, relative to their largest diagonal
 ROUNDING = 1e-13  # of speeds, relative to those of free flight
 CREEP = 1e-8  # speed that stands for the slip at stick, likewise
+CREEPS = 10.0 * CREEP  # a slip as small as what a weight leaves over; it has no direction worth following
+PATIENCE = 45
+STAYS = 1e-10  # change of velocity from one iterate to the next, relative in the mass norm
+CRUDE = 1e-6  # violation of the law, likewise
 
 
 class Problem(NamedTuple):
@@ -64,13 +79,17 @@ class Problem(NamedTuple):
         """Normal speed of each contact beyond its target."""
         return matvec(self.normal, velocity) - self.target
 
+    def mobility(self) -> Tensor:
+        """n mass^-1 n' [B, C], the normal speed that a unit of load causes at a contact alone."""
+        return (self.normal.square() / self.mass.unsqueeze(-2)).sum(-1)
+
     def mass_norm(self, velocity: Tensor) -> Tensor:
         """sqrt(v' mass v), the same unit for translation and rotation."""
         return (self.mass * velocity.square()).sum(-1).sqrt()
 
     def speed_scale(self) -> Tensor:
         """Largest normal speed [B, C] that a velocity with the energy of the free velocity can have."""
-        return ((self.normal.square() / self.mass.unsqueeze(-2)).sum(-1)).sqrt() * self.mass_norm(self.free)[:, None]
+        return self.mobility().sqrt() * self.mass_norm(self.free)[:, None]
 
 
 class Answer(NamedTuple):
@@ -97,8 +116,7 @@ class Answer(NamedTuple):
     def guess(problem: Problem) -> "Answer":
         """The free slip, and the load that stops each contact alone."""
         answer = Answer.free_flight(problem)
-        alone = (problem.normal.square() / problem.mass.unsqueeze(-2)).sum(-1)
-        load = torch.relu(-problem.excess(problem.free)) / alone
+        load = torch.relu(-problem.excess(problem.free)) / problem.mobility()
         return answer._replace(normal=load, slip=matvec(problem.tangents, problem.free.unsqueeze(-2)))
 
     def clone(self) -> "Answer":
@@ -176,11 +194,28 @@ def cone_lcp(problem: Problem, guide: Answer | None) -> Answer:
     slips = [slip_along]
     if problem.directions == 2:
         forces.append(-matvec(across[..., :-1], torch.cat(forces, dim=-1)) - across[..., -1])
-        slips.append(-forces[2] / torch.where(weight > 0.0, weight, 1.0))
     velocity = problem.free + matvec(response.mT, torch.cat(forces, dim=-1))
+    if problem.directions == 2:
+        # exact where a weight makes it small; what has no load slips as it will
+        loaded = weight > 0.0
+        across_speed = matvec(along[..., 1, :], velocity)
+        slips.append(torch.where(loaded, -forces[2] / torch.where(loaded, weight, 1.0), across_speed))
     friction = (torch.stack(forces[1:], dim=-1).unsqueeze(-2) @ axes).squeeze(-2)
     slip = (torch.stack(slips, dim=-1).unsqueeze(-2) @ axes).squeeze(-2)
     return Answer(velocity, normal, friction, slip, slip_along == 0.0, solution.solved, solution.solved)
+
+
+def law_violation(problem: Problem, answer: Answer) -> Tensor:
+    """Largest violation [B] of |f| <= mu lambda and of f along -slip; relative, see `SETTLED`.
+
+    |f - P(f - slip / a)| a, with P the projection onto the disc of radius mu lambda and a the mobility.
+    """
+    a, limit = problem.mobility(), problem.mu * answer.normal
+    pushed = answer.friction - answer.slip / a.unsqueeze(-1)
+    size = torch.linalg.vector_norm(pushed, dim=-1)
+    factor = torch.where(size > limit, limit / size.clamp_min(1e-300), 1.0)
+    wrong = torch.linalg.vector_norm(answer.friction - factor.unsqueeze(-1) * pushed, dim=-1)
+    return (a * wrong / (problem.speed_scale() + a * answer.normal).clamp_min(1e-300)).amax(-1)
 
 
 def polygon_lcp(problem: Problem, k: int) -> Answer:
@@ -212,14 +247,13 @@ def _facets(problem: Problem, guide: Answer | None) -> tuple[Tensor, Tensor]:
         raise ValueError("guide: expected an iterate, got None")
     with torch.no_grad():
         slip = torch.linalg.vector_norm(guide.slip, dim=-1)
-        creep = CREEP * problem.speed_scale()
-        # A slip as small as what a weight leaves over has no direction worth following.
-        sticks = guide.sticks | (slip <= 10.0 * creep)
+        scale = problem.speed_scale()
+        sticks = guide.sticks | (slip <= CREEPS * scale)
         direction = torch.where(sticks.unsqueeze(-1), -guide.friction, guide.slip)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         some = length > 0.0
         t = torch.where(some, direction / torch.where(some, length, 1.0), direction.new_tensor([1.0, 0.0]))
-        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), creep)
+        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), CREEP * scale)
         s = torch.stack((-t[..., 1], t[..., 0]), dim=-1)
         weight = torch.where(speed > 0.0, problem.mu * guide.normal / torch.where(speed > 0.0, speed, 1.0), 0.0)
         return torch.stack((t, s), dim=-2), weight

@@ -113,7 +113,8 @@ class PlanarStack:
     which is taken as endless: the upper rectangle must not reach beyond it.
 
     Attributes:
-        lower, upper: Half width and half height of each rectangle [m].
+        lower: Half width and half height of the rectangle on the ground [m].
+        upper: The same of the one on top of it.
         masses: Of lower and upper [kg], spread evenly.
         mu: Friction coefficient at the ground and between the two; >= 0.
         dt: Step size [s].

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lcplearn.scenes.contact_kernel import compiled, fingerprint
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
 from lcplearn.scenes.pushing_kernel import (
     AWAY,
     SLIDES,

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lcplearn.scenes.contact_kernel import compiled, fingerprint
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
 from lcplearn.scenes.pushing_kernel import finger_mode, memory_of, settle_element
 from lcplearn.scenes.pushing_lcp import Bearing
 from lcplearn.scenes.pushing_node import as_array

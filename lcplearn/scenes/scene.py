@@ -73,6 +73,11 @@ class Trajectory(NamedTuple):
     mode: Int[Tensor, "*batch T contacts"]
     solved: Bool[Tensor, "*batch T"] | None = None
 
+    @property
+    def states(self) -> Float[Tensor, "*batch instants nq_plus_nv"]:
+        """Positions, then velocities."""
+        return torch.cat((self.positions, self.velocities), dim=-1)
+
 
 @runtime_checkable
 class Scene(Protocol):

@@ -67,6 +67,23 @@ class Space:
             )
         return state[..., : self.nq], state[..., self.nq :]
 
+    def normalised(
+        self, state: Float[Tensor, "*batch nq_plus_nv"], name: str = "state"
+    ) -> Float[Tensor, "*batch nq_plus_nv"]:
+        """The state with a quaternion of norm 1, where it has one.
+
+        Raises:
+            ValueError: its norm is farther from 1 than rounded digits explain, 1e-3.
+        """
+        position, velocity = self.split(state)
+        if self.nq == self.nv:
+            return state
+        norm = position[..., -4:].norm(dim=-1, keepdim=True)
+        if not bool(((norm - 1.0).abs() < 1e-3).all()):
+            worst = norm.flatten()[(norm - 1.0).abs().argmax()].item()
+            raise ValueError(f"{name}: expected a quaternion of norm 1, got one of norm {worst:.6g}")
+        return torch.cat((position[..., :-4], position[..., -4:] / norm, velocity), dim=-1)
+
     def advance(
         self, position: Float[Tensor, "*#batch nq"], velocity: Float[Tensor, "*#batch nv"], dt: float
     ) -> Float[Tensor, "..."]:

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lcplearn.scenes.contact_adjoint import contact_memory, pull_back_contacts
-from lcplearn.scenes.contact_kernel import compiled, fingerprint
+from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
 from lcplearn.scenes.spatial_kernel import SMALL, Options, Rolled, approach, roll, rotation
 
 
@@ -135,7 +135,7 @@ def _make_roll_back(sources: str) -> Any:
         memory = contact_memory(C, 6, 2)
         rows, y, rows_ = np.empty((3 * C, 6)), np.empty(3 * C), np.empty((3 * C, 6))
         sticks, mu_i, soft, index = np.empty(C, np.bool_), np.empty(C), np.empty(C), np.empty(C, np.int64)
-        target_, mu_, soft_, share = np.empty(C), np.empty(C), np.empty(C), np.empty(C)
+        target_, mu_, soft_, share, nothing = np.empty(C), np.empty(C), np.empty(C), np.empty(C), np.zeros(3 * C)
         free, free_, v, v_, x_ = np.empty(6), np.empty(6), np.empty(6), np.empty(6), np.empty(13)
         R, R_ = np.empty((3, 3)), np.empty((3, 3))
         for b in range(B):
@@ -174,8 +174,8 @@ def _make_roll_back(sources: str) -> Any:
                     free_[:] = v_
                     if K:
                         pull_back_contacts(
-                            K, 2, 6, rows, y, sticks, mu_i, soft, free, m, v_, memory, free_, rows_, target_, mu_,
-                            soft_, mass_[b],
+                            K, 2, 6, rows, y, sticks, mu_i, soft, free, m, v_, nothing, memory, free_, rows_, target_,
+                            mu_, soft_, mass_[b],
                         )  # fmt: skip
                 else:
                     K = 0
@@ -223,7 +223,7 @@ def _make_roll_back(sources: str) -> Any:
     return compiled(_roll_back, cached=True)
 
 
-_roll_back = _make_roll_back(fingerprint("contact_kernel.py", "contact_adjoint.py", "spatial_kernel.py"))
+_roll_back = _make_roll_back(fingerprint("contact_gradient.py", "spatial_kernel.py", "spatial_adjoint.py"))
 
 
 def roll_out(options: Options, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lcplearn.scenes.contact_kernel import call, compiled, contacts_address, fingerprint, solver_address
+from lcplearn.scenes.contact_kernel.compiling import call, compiled, fingerprint, solver_address
+from lcplearn.scenes.contact_kernel.steps import contacts_address
 
 SMALL = 1e-8  # squared half angle below which series are exact; as in space.py
 STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
@@ -160,7 +161,7 @@ def _make_roll(sources: str) -> Any:
     return compiled(_roll, cached=True)
 
 
-_roll = _make_roll(fingerprint("contact_kernel.py", "spatial_kernel.py"))
+_roll = _make_roll(fingerprint("spatial_kernel.py"))
 
 
 class Options(NamedTuple):

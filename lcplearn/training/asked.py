@@ -11,7 +11,7 @@ from lcplearn.datasets import Task
 from lcplearn.formulations import Formulation
 from lcplearn.training.checkpoint import describe
 from lcplearn.training.module import FormulationModule
-from lcplearn.training.settings import FROM_DATA
+from lcplearn.training.vocabulary import FROM_DATA
 
 
 def hyperparameters(module: FormulationModule, used: Mapping[str, Any], epochs: int) -> dict[str, Any]:
@@ -42,14 +42,6 @@ def described_data(data: Task, settings: Mapping[str, Any] | None) -> dict[str, 
                 digest.update(tensor.detach().cpu().numpy().tobytes())
     known = {name: value for name, value in (settings or {}).get("data", {}).items() if name != "path"}
     return known | {"recordings": digest.hexdigest()[:16]}
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values by dotted names."""
-    found: dict[str, Any] = {}
-    for key, value in values.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
 
 
 def write_config(folder: Path, settings: Mapping[str, Any]) -> None:

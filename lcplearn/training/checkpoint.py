@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from lcplearn.formulations import FORMULATIONS, Formulation
+from lcplearn.formulations.baselines import Baseline
 from lcplearn.formulations.pushing import PushModel
 from lcplearn.scenes.space import Space
 
@@ -85,7 +86,10 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
     if wrong:
         raise ValueError(f"{path}: {wrong[0]} is not finite; the training that wrote it had diverged.")
     try:
-        model = cls(**_restored(checkpoint["formulation"]["arguments"]))
+        arguments = _restored(checkpoint["formulation"]["arguments"])
+        if issubclass(cls, Baseline):
+            arguments.pop("gravity", None)  # in version 0.1 they took it, without a use for it
+        model = cls(**arguments)
         model.load_state_dict(state)
     except (TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
@@ -143,7 +147,10 @@ def check_resumable(
     """
     checkpoint = read(path)
     if not {"objective", "training", "epoch"} <= set(checkpoint):
-        raise ValueError(f"{path} holds a model, but no training that could go on.")
+        raise ValueError(
+            f"{path} holds a model, but no training that could go on, as those of lcplearn 0.1: "
+            "it predicts, and is trained further from the start, without ckpt_path."
+        )
     saved, now = checkpoint["formulation"], ours["formulation"]
     # By name: a module may have moved since.
     if saved["class"].rpartition(".")[2] != now["class"].rpartition(".")[2]:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lcplearn.formulations import Formulation
 from lcplearn.scenes.scene import STICK_SPEED, Drive
+from lcplearn.training import toss_figures
 from lcplearn.training.metrics import Predictions
 
 if TYPE_CHECKING:
@@ -22,10 +23,12 @@ def draw(found: Predictions) -> dict[str, "Figure"]:
     """Draw what applies to a task and a model, from predictions that judges have asked for already.
 
     Returns:
-        Figures by name: rollouts, error_over_horizon; stops on slides; else on a line, for models that need no measured
-        friction, one_step_map.
+        Figures by name: rollouts, error_over_horizon; of tosses those of `toss_figures`; stops on slides; else on a
+        line, for models that need no measured friction, one_step_map.
     """
     pictures = {"rollouts": rollouts(found), "error_over_horizon": error_over_horizon(found)}
+    if "tosses" in found.task.judged_by:
+        pictures |= toss_figures.draw(found)
     if "stops" in found.task.judged_by:
         pictures["stops"] = stops(found)
     elif found.model.space.nv == 1 and not found.model.needs_friction:  # no force acts on slides
@@ -36,7 +39,7 @@ def draw(found: Predictions) -> dict[str, "Figure"]:
 @torch.no_grad()
 def one_step_map(found: Predictions, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3)) -> "Figure":
     """Velocity after a step from position 0 against the force, for a few velocities before it, and the true one."""
-    figure, axes = _figure(1, 1, (7.0, 4.5))
+    figure, axes = new_figure(1, 1, (7.0, 4.5))
     ax, task = axes[0][0], found.task
     reach = 2.0 * float(task.test.drive.force.abs().max()) or 1.0
     force = torch.linspace(-reach, reach, 801, dtype=torch.float64).unsqueeze(-1)
@@ -62,7 +65,7 @@ def one_step_map(found: Predictions, speeds: tuple[float, ...] = (-0.3, 0.0, 0.3
 
 def rollouts(found: Predictions, count: int = 3) -> "Figure":
     """Velocity (or speed) of a few test recordings, predicted from their start; strips show when the body rests."""
-    figure, axes = _figure(count, 1, (8.0, 2.1 * count + 0.6))
+    figure, axes = new_figure(count, 1, (8.0, 2.1 * count + 0.6))
     task, model = found.task, found.model
     chosen = torch.linspace(0, len(task.test.steps) - 1, count).long()  # those from rest come first
     test = task.test.map(lambda values: values[chosen])
@@ -88,7 +91,7 @@ def rollouts(found: Predictions, count: int = 3) -> "Figure":
 
 def stops(found: Predictions) -> "Figure":
     """How far each slide goes: predicted from its start against recorded."""
-    figure, axes = _figure(1, 1, (5.2, 4.8))
+    figure, axes = new_figure(1, 1, (5.2, 4.8))
     test = found.task.test
     rows, positions = torch.arange(len(test.steps)), (found.test.positions[..., 0], test.states[..., 0])
     predicted, recorded = (1e3 * (x[rows, test.steps] - x[:, 0]) for x in positions)
@@ -122,10 +125,9 @@ def strip(
 
 def error_over_horizon(found: Predictions) -> "Figure":
     """Root mean square and largest error of the velocity against the steps since the start of the rollout."""
-    figure, axes = _figure(1, 1, (7.0, 4.0))
+    figure, axes = new_figure(1, 1, (7.0, 4.0))
     recordings, path = found.long_recordings, found.long
-    predicted = torch.cat((path.positions, path.velocities), dim=-1)
-    error = found.model.velocity_error(predicted[:, 1:], recordings.truth[:, 1:]).sqrt()
+    error = found.model.velocity_error(path.states[:, 1:], recordings.truth[:, 1:]).sqrt()
     known = recordings.valid
     error = torch.where(known, error, 0.0)
     error = error.nan_to_num(nan=1e12).clamp(max=1e12)  # more is not drawn: it has diverged
@@ -157,7 +159,7 @@ def _limits(predicted: Tensor, true: Tensor) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", list[list["Axes"]]]:
+def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", list[list["Axes"]]]:
     """A figure without pyplot, so that it needs no display and is freed by itself."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -105,9 +105,7 @@ def judge_stops(found: Predictions) -> Figures:
 def judge_tosses(found: Predictions) -> Figures:
     """How far whole tosses of a cube are from the recorded ones; see `toss_metrics`."""
     test, path = found.task.test, found.test
-    scores = score_tosses(
-        test.states, torch.cat((path.positions, path.velocities), dim=-1), test.steps, found.task.given["half_width"]
-    )
+    scores = score_tosses(test.states, path.states, test.steps, found.task.given["half_width"])
     position, rotation = (
         summarise(scores[name]) for name in ("position integral [% width]", "rotation integral [deg]")
     )
@@ -192,8 +190,7 @@ def describe_model(model: Formulation, task: Task) -> str:
 def _rollout_rmse(model: Formulation, path: Trajectory, recordings: Recordings, steps: int) -> float | None:
     if not bool((recordings.steps >= steps).all()):
         return None
-    predicted = torch.cat((path.positions, path.velocities), dim=-1)
-    return _rms(model.velocity_error(predicted[:, 1 : steps + 1], recordings.truth[:, 1 : steps + 1]))
+    return _rms(model.velocity_error(path.states[:, 1 : steps + 1], recordings.truth[:, 1 : steps + 1]))
 
 
 @torch.no_grad()

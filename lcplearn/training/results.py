@@ -10,7 +10,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from lcplearn.datasets import Task
 from lcplearn.formulations import Formulation
-from lcplearn.training import figures
+from lcplearn.training import figures, toss_figures
 from lcplearn.training.metrics import Predictions, evaluate, table
 from lcplearn.training.writing import write_figures
 
@@ -47,6 +47,11 @@ def leave(
         figure.suptitle(f"{type(model).__name__}   {folder.name}", fontsize=11)
         figure.savefig(folder / f"{name}.png", dpi=120)
     _log(trainer, metrics, used, pictures)
+    if "tosses" in task.judged_by:
+        moving = toss_figures.animation(toss_figures.median_toss(predictions))
+        (folder / "toss.gif").write_bytes(moving)
+        if isinstance(trainer.logger, TensorBoardLogger):
+            toss_figures.log_animation(trainer.logger.experiment, moving, trainer.global_step)
     return metrics
 
 

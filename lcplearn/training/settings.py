@@ -3,20 +3,17 @@
 Settings are plain dictionaries here: only train.py knows Hydra. What a `_target_` accepts is read from its source.
 """
 
-import ast
-import difflib
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-TRAINER = "lightning.pytorch.trainer.trainer.Trainer"
-FROM_DATA = {"dt", "gravity", "space", "given", "vertices", "com"}  # of a model, which takes them from its data
-UNLIKELY = {"min_epochs"}  # what nobody means who writes something alike
+from lcplearn.training.signatures import signature
+from lcplearn.training.vocabulary import FROM_DATA, TRAINER, suggestion, unknown, vocabulary
+
 # Ranges that the targets check too, seconds later: of data, model and optimizer.
 POSITIVE = {
     *("dt", "mass", "trajectories", "length", "width", "initial_mass", "initial_mu", "lr", "lbfgs_iterations", "shift"),
@@ -42,16 +39,16 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
         SettingsError: the first mistake found.
     """
     for key in settings:
-        if key not in _vocabulary(conf, "")[0]:
-            raise SettingsError(_unknown(key, conf))
+        if key not in vocabulary(conf, "")[0]:
+            raise SettingsError(unknown(key, conf))
     for key, kind in (("seed", "int"), ("threads", "int"), ("batch_size", "int | None"), ("patience", "int | None")):
         _check_type(key, settings.get(key), kind)
     if settings["threads"] < 1:
-        raise SettingsError(f"threads must be at least 1, got {settings['threads']}.")
+        raise SettingsError(f"threads: expected at least 1, got {settings['threads']}")
     if settings["patience"] is not None and settings["patience"] < 1:
-        raise SettingsError(f"patience must be at least 1, or null for never, got {settings['patience']}.")
+        raise SettingsError(f"patience: expected at least 1, or null for never, got {settings['patience']}")
     if not 0 <= settings["seed"] < 2**32:  # what NumPy's generator takes
-        raise SettingsError(f"seed must be at least 0 and below 2^32, got {settings['seed']}.")
+        raise SettingsError(f"seed: expected at least 0 and below 2^32, got {settings['seed']}")
     _check_friction(settings)
     _check_pushes(settings, conf)
     for group in ("data", "model", "optimizer", "logger"):
@@ -61,18 +58,18 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
         raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
     _check_ranges(settings)
     own = not str(settings["model"].get("_target_")).startswith("lcplearn.")  # and may have loss terms of its own
-    _check_loss(settings["loss"], settings["loss"] if own else _vocabulary(conf, "loss")[0])
+    _check_loss(settings["loss"], settings["loss"] if own else vocabulary(conf, "loss")[0])
     length, horizon = settings["data"].get("length"), settings["loss"].get("horizon", 1)
     if length is not None and horizon > length:
-        raise SettingsError(f"loss.horizon={horizon} is longer than the recordings: data.length={length}.")
+        raise SettingsError(f"loss.horizon: expected at most data.length={length}, got {horizon}")
     _check_arguments("trainer", settings["trainer"], TRAINER)
     for key in ("max_epochs", "check_val_every_n_epoch"):
         epochs = settings["trainer"].get(key, 1)
         if epochs is None or epochs < 1:
-            raise SettingsError(f"trainer.{key} must be at least 1, got {epochs}.")
+            raise SettingsError(f"trainer.{key}: expected at least 1, got {epochs}")
     if settings["trainer"].get("precision", "64-true") not in ("64-true", "64", 64):
         precision = settings["trainer"]["precision"]
-        raise SettingsError(f"trainer.precision must be 64-true, as sticking is judged at 1e-12 m/s; got {precision}.")
+        raise SettingsError(f"trainer.precision: expected 64-true, as sticking is judged at 1e-12 m/s, got {precision}")
     _check_processes(settings["trainer"], multirun, processes)
     _check_checkpoint(settings.get("ckpt_path"))
 
@@ -122,9 +119,9 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
             if key in POSITIVE and not 0 < value < float("inf"):
-                raise SettingsError(f"{group}.{key} must be positive, got {value}.")
+                raise SettingsError(f"{group}.{key}: expected a positive number, got {value}")
             if key in AT_LEAST_0 and not 0 <= value < float("inf"):
-                raise SettingsError(f"{group}.{key} must be at least 0, got {value}.")
+                raise SettingsError(f"{group}.{key}: expected at least 0, got {value}")
 
 
 def _check_friction(settings: Mapping[str, Any]) -> None:
@@ -164,11 +161,11 @@ def _check_loss(loss: Mapping[str, Any], known: Iterable[str]) -> None:
         _known(key, sorted(known), "setting", prefix="loss.")
         _check_type(f"loss.{key}", value, "int" if key == "horizon" else "float")
         if not 0 <= value < float("inf"):
-            raise SettingsError(f"loss.{key} must be finite and at least 0, got {value}.")
+            raise SettingsError(f"loss.{key}: expected a finite number of at least 0, got {value}")
     if not any(value for key, value in loss.items() if key != "horizon"):
-        raise SettingsError("All loss weights are zero: set one, for instance loss.prediction=1.0.")
+        raise SettingsError("loss: expected a positive weight, loss.prediction=1.0 for instance, got none")
     if loss.get("horizon", 1) < 1:
-        raise SettingsError(f"loss.horizon must be at least 1, got {loss['horizon']}.")
+        raise SettingsError(f"loss.horizon: expected at least 1, got {loss['horizon']}")
 
 
 def _check_checkpoint(path: Any) -> None:
@@ -183,7 +180,7 @@ def _check_checkpoint(path: Any) -> None:
 
 def _check_target(group: str, values: Any) -> None:
     if not isinstance(values, Mapping) or not isinstance(values.get("_target_"), str):
-        raise SettingsError(f"{group} must be the name of a file in conf/{group}/, got {values!r}.")
+        raise SettingsError(f"{group}: expected the name of a file in conf/{group}/, got {values!r}")
     arguments = {key: value for key, value in values.items() if not key.startswith("_")}
     _check_arguments(group, arguments, values["_target_"])
 
@@ -201,14 +198,7 @@ def _check_arguments(group: str, arguments: Mapping[str, Any], target: str) -> N
 
 def _known(key: str, known: Iterable[str], what: str, prefix: str = "") -> None:
     if key not in known:
-        raise SettingsError(f"Unknown {what} '{prefix}{key}'; {_suggestion(key, known, prefix)}")
-
-
-def _suggestion(key: str, known: Iterable[str], prefix: str = "") -> str:
-    close = difflib.get_close_matches(key, [name for name in known if name not in UNLIKELY], n=1, cutoff=0.5)
-    if close:
-        return f"did you mean '{prefix}{close[0]}'?"
-    return f"known are {', '.join(sorted(prefix + name for name in known))}."
+        raise SettingsError(f"Unknown {what} '{prefix}{key}'; {suggestion(key, known, prefix)}")
 
 
 def _check_type(name: str, value: Any, annotation: str) -> None:
@@ -221,105 +211,12 @@ def _check_type(name: str, value: Any, annotation: str) -> None:
     allowed = tuple(cls for kind in kinds for cls in TYPES[kind])
     wrong_bool = isinstance(value, bool) and bool not in allowed  # bool is an int to isinstance
     if wrong_bool or not isinstance(value, allowed):
-        raise SettingsError(f"{name} must be {' or '.join(kinds)}, got {value!r}.")
+        raise SettingsError(f"{name}: expected {' or '.join(kinds)}, got {value!r}")
 
 
-def signature(target: str) -> dict[str, str] | None:
-    """Argument names and annotations of a class or function, from its source; None if it can't be found there.
-
-    `**` is among the names where any keyword is accepted.
-    """
-    package, *modules, name = target.split(".")
-    spec = find_spec(package) if modules else None
-    if spec is None or not spec.submodule_search_locations:
-        return None
-    path = Path(spec.submodule_search_locations[0]).joinpath(*modules)
-    file = next((f for f in (path.with_suffix(".py"), path / "__init__.py") if f.is_file()), None)
-    if file is None:
-        return None
-    definitions = {
-        node.name: node for node in ast.parse(file.read_text()).body if isinstance(node, ast.ClassDef | ast.FunctionDef)
-    }
-    return _arguments(definitions, name)
-
-
-def _arguments(definitions: Mapping[str, ast.ClassDef | ast.FunctionDef], name: str) -> dict[str, str] | None:
-    node = definitions.get(name)
-    if isinstance(node, ast.ClassDef):
-        init = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
-        if init is None and any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
-            fields = [n for n in node.body if isinstance(n, ast.AnnAssign)]
-            return {ast.unparse(field.target): ast.unparse(field.annotation) for field in fields}
-        if init is None:
-            base = next((b.id for b in node.bases if isinstance(b, ast.Name)), "")
-            return _arguments(definitions, base)
-        node = init
-    if node is None:
-        return None
-    found = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
-    names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in found if a.arg != "self"}
-    return names | ({"**": ""} if node.args.kwarg else {})
-
-
-def explain(message: str, conf: Path) -> str:
-    """Turn Hydra's message about a mistyped override into one sentence with a suggestion.
-
-    Args:
-        message: Text of Hydra's error.
-        conf: Folder of the configuration.
-    """
-    unknown = re.search(r"Could not override '([\w.@/]+)'", message)
-    missing = re.search(r"Could not find '([\w./]+)/([\w.-]+)'", message)
-    if missing:
-        group, choice = missing[1], missing[2]
-        if group == "hydra/launcher":
-            return f"There is no {group}={choice} among the installed ones; joblib's is in the extra 'sweep'."
-        options = [file.stem for file in (conf / group).glob("*.yaml")]
-        return f"There is no {group}={choice}; {_suggestion(choice, options)}"
-    if unknown:
-        group, _, key = unknown[1].rpartition(".")
-        in_files, in_code = _vocabulary(conf, group)
-        if key in in_code and key not in in_files:
-            return f"'{unknown[1]}' is not set in conf/{group}; to add it, write +{unknown[1]}=..."
-        if not group:
-            return _unknown(key, conf)
-        if key in in_files:
-            return f"'{unknown[1]}' is a setting of another {group}= than the chosen one."
-        return f"Unknown setting '{unknown[1]}'; {_suggestion(key, in_files | in_code, f'{group}.')}"
-    several = re.search(r"Ambiguous value for argument '([^']+)'", message)
-    if several:
-        return f"{several[1]} are several values: -m before the settings trains one run after the other."
-    unread = re.search(r"Error parsing override '(.*?)'", message)
-    if unread:
-        return f"'{unread[1]}' is no setting: write key=value, and in quotes what has special characters."
-    return " ".join(message.split())  # Hydra breaks its lines
-
-
-def _unknown(key: str, conf: Path) -> str:
-    """A key that does not stand at the top level, but maybe in a group."""
-    top = _vocabulary(conf, "")[0]
-    groups = sorted(folder.name for folder in conf.iterdir() if folder.is_dir() and folder.name != "experiment")
-    below = {f"{group}.{name}" for group in groups for names in _vocabulary(conf, group) for name in names}
-    exact = sorted(name for name in below if name.partition(".")[2] == key)
-    if exact:
-        return f"Unknown setting '{key}'; did you mean {' or '.join(map(repr, exact))}?"
-    if not difflib.get_close_matches(key, top, n=1, cutoff=0.5):
-        names = {name.partition(".")[2]: name for name in below if name.partition(".")[2] not in UNLIKELY}
-        close = difflib.get_close_matches(key, names, n=1, cutoff=0.7)
-        if close:
-            return f"Unknown setting '{key}'; did you mean '{names[close[0]]}'?"
-    return f"Unknown setting '{key}'; {_suggestion(key, top)}"
-
-
-def _vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:
-    """Keys of a group's files, and those that its targets accept besides."""
-    files = list((conf / group).glob("*.yaml")) if group else [conf / "train.yaml"]
-    contents = [yaml.safe_load(file.read_text()) or {} for file in files]
-    contents = [content.get(group, content) for content in contents]  # files of package _global_ name their group
-    in_files = {key for content in contents for key in content if not key.startswith("_")} - {"defaults"}
-    if not group:
-        return in_files | {folder.name for folder in conf.iterdir() if folder.is_dir()}, set()
-    targets = {content["_target_"] for content in contents if "_target_" in content}
-    targets |= {TRAINER} if group == "trainer" else set()
-    in_code = {name for target in targets for name in signature(target) or {}} - {"**"}
-    return in_files, in_code - FROM_DATA if group == "model" else in_code
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by dotted names."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found

@@ -43,8 +43,10 @@ def plan(
         lr: Learning rate of the last stage.
 
     Raises:
-        ValueError: A stage lacks its epochs, or leaves none to the last stage, or its horizon is out of range.
+        ValueError: No epoch, a stage lacks its epochs or leaves none to the last stage, or its horizon is out of range.
     """
+    if epochs < 1:
+        raise ValueError(f"epochs: expected at least 1, got {epochs}")
     stages: list[Stage] = []
     first = 0
     for number, given in enumerate((*before, {"epochs": epochs - sum(stage.get("epochs", 0) for stage in before)}), 1):

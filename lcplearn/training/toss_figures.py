@@ -4,15 +4,18 @@ from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from lcplearn.formulations.cube_corners import FACES, CubeCorners
 from lcplearn.scenes.scene import Mode
 from lcplearn.scenes.space import rotation_matrix
 from lcplearn.scenes.spatial_body import box_corners
+from lcplearn.training.metrics import Predictions
+from lcplearn.training.toss_metrics import score_tosses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,90 +27,117 @@ EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1
 COLOURS = {Mode.STICK: "tab:blue", Mode.SLIP: "tab:orange", Mode.SEPARATION: "0.92"}
 
 
-def filmstrip(
-    recorded: Float[Tensor, "rows 13"],
-    predicted: Float[Tensor, "rows 13"],
-    half_width: float,
-    dt: float,
-    *,
-    corners: Float[Tensor, "8 3"] | None = None,
-    frames: int = 6,
-) -> "Figure":
-    """A recorded toss beside its prediction, at a few instants.
+class Toss(NamedTuple):
+    """A recorded toss and its prediction: states [rows, 13], what each contact does [T, C], the time between rows."""
 
-    Args:
-        recorded, predicted: States of one toss.
-        half_width: Half of the cube's width [m].
-        dt: Time between rows [s].
-        corners: Those of the predicted body [m]; the cube's by default.
-        frames: How many instants.
-    """
-    figure, axes = _scenes(frames, (2.6 * frames, 3.0))
-    chosen = torch.linspace(0, len(recorded) - 1, frames).round().long().tolist()
-    limits = _limits(recorded, predicted, half_width)
+    recorded: Tensor
+    predicted: Tensor
+    mode: Tensor
+    half_width: float
+    dt: float
+    corners: Tensor | None
+
+
+def median_toss(found: Predictions) -> Toss:
+    """The toss whose error, position integral [% width] plus rotation integral [deg], is the median of all."""
+    test, path, half_width = found.task.test, found.test, found.task.given["half_width"]
+    predicted = torch.cat((path.positions, path.velocities), dim=-1)
+    scores = score_tosses(test.states, predicted, test.steps, half_width)
+    error = scores["position integral [% width]"] + scores["rotation integral [deg]"]
+    chosen = int(error.argsort()[len(error) // 2])
+    rows = int(test.steps[chosen]) + 1
+    corners = found.model.numbers()["corners"].detach() if isinstance(found.model, CubeCorners) else None
+    return Toss(
+        test.states[chosen, :rows],
+        predicted[chosen, :rows],
+        path.mode[chosen, : rows - 1],
+        half_width,
+        found.task.dt,
+        corners,
+    )
+
+
+def draw(found: Predictions) -> dict[str, "Figure"]:
+    """The toss of median error as a filmstrip and by its contacts; learned corners, where they are."""
+    toss, model = median_toss(found), found.model
+    pictures = {"filmstrip": filmstrip(toss)}
+    if model.contacts == 8:
+        pictures["contact_modes"] = contact_modes(toss)
+    if isinstance(model, CubeCorners) and toss.corners is not None:
+        start = CubeCorners(**dict(model.arguments)).numbers()["corners"].detach()
+        pictures["corners"] = corner_views(toss.corners, start, toss.half_width)
+    return pictures
+
+
+def filmstrip(toss: Toss, *, frames: int = 6) -> "Figure":
+    """A recorded toss and its prediction at a few instants."""
+    figure, axes = _scenes(frames, (2.0 * frames, 2.1))
+    chosen = torch.linspace(0, len(toss.recorded) - 1, frames).round().long().tolist()
+    limits = _limits(toss)
     for ax, row in zip(axes, chosen, strict=True):
-        _frame(ax, recorded[row], predicted[row], half_width, corners, limits)
-        ax.set_title(f"{row * dt:.2f} s", fontsize=9, y=0.92)
-    figure.suptitle("recorded (grey) and predicted from the first row alone (red)", fontsize=10)
+        _frame(ax, toss, row, limits)
+        ax.set_title(f"{row * toss.dt:.2f} s", fontsize=9, y=0.9)
+    figure.supxlabel("a real toss (grey), and predicted from its first row alone (red)", fontsize=10)
     return figure
 
 
-def animation(
-    recorded: Float[Tensor, "rows 13"],
-    predicted: Float[Tensor, "rows 13"],
-    half_width: float,
-    dt: float,
-    *,
-    corners: Float[Tensor, "8 3"] | None = None,
-    every: int = 2,
-) -> bytes:
-    """The same as a GIF, every second row at a quarter of the speed."""
+def animation(toss: Toss, *, every: int = 3) -> bytes:
+    """The same as a GIF, every third row at a quarter of the speed."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     figure, (ax,) = _scenes(1, (4.2, 3.4))
-    limits = _limits(recorded, predicted, half_width)
+    limits = _limits(toss)
 
-    def draw(row: int) -> list[Any]:
+    def show(row: int) -> list[Any]:
         ax.clear()
-        _frame(ax, recorded[row], predicted[row], half_width, corners, limits)
-        ax.set_title(f"{row * dt:.2f} s   recorded (grey), predicted (red)", fontsize=9)
+        _frame(ax, toss, row, limits)
+        ax.set_title(f"{row * toss.dt:.2f} s   recorded (grey), predicted (red)", fontsize=9)
         return []
 
-    rows = [*range(0, len(recorded), every), *[len(recorded) - 1] * 8]
-    film = FuncAnimation(figure, draw, frames=rows)
+    rows = [*range(0, len(toss.recorded), every), *[len(toss.recorded) - 1] * 8]
+    moving = FuncAnimation(figure, show, frames=rows)
     with TemporaryDirectory() as folder:  # PillowWriter writes to a path only
         path = Path(folder) / "toss.gif"
-        film.save(path, writer=PillowWriter(fps=round(1.0 / (4.0 * every * dt))), dpi=72)
+        moving.save(path, writer=PillowWriter(fps=round(1.0 / (4.0 * every * toss.dt))), dpi=72)
         return path.read_bytes()
+
+
+def log_animation(writer: Any, moving: bytes, step: int) -> None:
+    """Show a GIF among TensorBoard's images, which its own call for videos does only with another package."""
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    image = Summary.Image(encoded_image_string=moving, colorspace=3)
+    writer.file_writer.add_summary(Summary(value=[Summary.Value(tag="test/toss", image=image)]), step)
+    writer.flush()
 
 
 def corner_views(learned: Float[Tensor, "8 3"], start: Float[Tensor, "8 3"], half_width: float) -> "Figure":
     """Learned corners from three sides, with where they started and the published cube."""
     figure, axes = _figure(1, 3, (10.5, 3.8))
     true = box_corners(torch.full((3,), half_width, dtype=learned.dtype))
-    for ax, (a, b), name in zip(axes[0], ((0, 1), (0, 2), (1, 2)), ("top", "front", "side"), strict=True):
-        styles: list[tuple[Tensor, dict[str, Any]]] = [
-            (true, {"color": "0.7", "linewidth": 4.0, "alpha": 0.6}),
-            (start, {"color": "tab:blue", "linewidth": 0.7, "linestyle": ":"}),
-            (learned, {"color": PREDICTED, "linewidth": 1.4, "marker": "."}),
-        ]
-        for shape, style in styles:
-            for i, j in EDGES:
-                ax.plot([shape[i, a], shape[j, a]], [shape[i, b], shape[j, b]], **style)
-        ax.set(aspect="equal", title=name, xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
-    for colour, name in (("0.7", "published cube"), ("tab:blue", "start"), (PREDICTED, "learned")):
-        axes[0][0].plot([], [], color=colour, label=name)
-    axes[0][0].legend(fontsize=8)
+    reach = 1.1e3 * float(torch.stack((learned, start, true)).abs().max())
+    styles: tuple[tuple[str, Tensor, dict[str, Any]], ...] = (
+        ("published cube", true, {"color": "0.7", "linewidth": 4.0, "alpha": 0.6}),
+        ("start", start, {"color": "tab:blue", "linewidth": 0.9, "linestyle": ":"}),
+        ("learned", learned, {"color": PREDICTED, "linewidth": 1.4, "marker": "."}),
+    )
+    for ax, (a, b), view in zip(axes[0], ((0, 1), (0, 2), (1, 2)), ("top", "front", "side"), strict=True):
+        for name, shape, style in styles:
+            for number, (i, j) in enumerate(EDGES):
+                ends = 1e3 * shape[[i, j]]
+                ax.plot(ends[:, a], ends[:, b], label=None if number else name, **style)
+        ax.set(aspect="equal", title=view, xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    axes[0][0].legend(fontsize=8, loc="center")
     return figure
 
 
-def contact_modes(
-    recorded: Float[Tensor, "rows 13"], predicted: Float[Tensor, "rows 13"], mode: Int[Tensor, "T 8"], dt: float
-) -> "Figure":
-    """What each corner does along a predicted toss, over the speeds."""
+def contact_modes(toss: Toss) -> "Figure":
+    """What each corner does along a predicted toss, under the speeds."""
     figure, axes = _figure(2, 1, (8.0, 5.0))
-    time = torch.arange(len(predicted)) * dt
-    for states, colour, name in ((recorded, RECORDED, "recorded"), (predicted, PREDICTED, "predicted")):
+    dt, mode = toss.dt, toss.mode
+    time = torch.arange(len(toss.predicted)) * dt
+    for states, colour, name in ((toss.recorded, RECORDED, "recorded"), (toss.predicted, PREDICTED, "predicted")):
         axes[0][0].plot(time, states[:, 7:10].norm(dim=-1), color=colour, label=name)
     axes[0][0].set(ylabel="speed [m/s]", xlim=(0.0, float(time[-1])))
     axes[0][0].legend(fontsize=8)
@@ -156,33 +186,31 @@ def as_png(figure: "Figure", dpi: int = 120) -> bytes:
     return buffer.getvalue()
 
 
-def _frame(
-    ax: Any,
-    recorded: Float[Tensor, " 13"],
-    predicted: Float[Tensor, " 13"],
-    half_width: float,
-    corners: Float[Tensor, "8 3"] | None,
-    limits: Sequence[tuple[float, float]],
-) -> None:
+def _frame(ax: Any, toss: Toss, row: int, limits: Sequence[tuple[float, float]]) -> None:
     """Two bodies over the board."""
-    cube = box_corners(torch.full((3,), half_width, dtype=torch.float64))
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    cube = box_corners(torch.full((3,), toss.half_width, dtype=torch.float64))
     (x0, x1), (y0, y1), (z0, z1) = limits
-    ax.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], [0.0] * 5, color="0.8", linewidth=0.8)
-    body = cube if corners is None else corners
-    for state, shape, style in (
-        (recorded, cube, {"color": RECORDED, "linewidth": 2.4, "alpha": 0.6}),
-        (predicted, body, {"color": PREDICTED, "linewidth": 1.2}),
-    ):
+    board = [(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)]
+    ax.computed_zorder = False  # matplotlib would guess which of two bodies is in front
+    ax.add_collection3d(Poly3DCollection([board], facecolor="0.95", edgecolor="0.75", zorder=1))
+    learned = cube if toss.corners is None else toss.corners
+    bodies = (
+        (toss.recorded[row], cube, {"facecolor": (0.2, 0.2, 0.2, 0.12), "edgecolor": "0.45", "linewidth": 1.6}),
+        (toss.predicted[row], learned, {"facecolor": (0.0, 0.0, 0.0, 0.0), "edgecolor": PREDICTED, "linewidth": 1.2}),
+    )
+    for zorder, (state, shape, style) in enumerate(bodies, 2):
         points = state[:3] + shape @ rotation_matrix(state[3:7] / state[3:7].norm()).mT
-        for i, j in EDGES:
-            ax.plot(*zip(points[i].tolist(), points[j].tolist(), strict=True), **style)
+        faces = [points[[a, b, d, c]].tolist() for a, b, c, d in FACES]
+        ax.add_collection3d(Poly3DCollection(faces, zorder=zorder, **style))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), zlim=(z0, z1))
-    ax.set_box_aspect((x1 - x0, y1 - y0, z1 - z0), zoom=1.35)
+    ax.set_box_aspect((x1 - x0, y1 - y0, z1 - z0), zoom=1.5)
     ax.set_axis_off()
 
 
-def _limits(recorded: Tensor, predicted: Tensor, half_width: float) -> list[tuple[float, float]]:
-    places, margin = torch.cat((recorded[:, :3], predicted[:, :3])), 1.8 * half_width
+def _limits(toss: Toss) -> list[tuple[float, float]]:
+    places, margin = torch.cat((toss.recorded[:, :3], toss.predicted[:, :3])), 1.8 * toss.half_width
     low, high = places.amin(0) - margin, places.amax(0) + margin
     low[2] = 0.0
     return list(zip(low.tolist(), high.tolist(), strict=True))
@@ -199,6 +227,6 @@ def _scenes(count: int, size: tuple[float, float]) -> tuple["Figure", list[Any]]
 
 
 def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", list[list["Axes"]]]:
-    from lcplearn.training.figures import _figure as figure
+    from lcplearn.training.figures import new_figure
 
-    return figure(rows, columns, size)
+    return new_figure(rows, columns, size)

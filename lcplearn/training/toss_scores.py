@@ -37,8 +37,7 @@ def read_for(path: Path | str, model: Formulation) -> Tosses:
 @torch.no_grad()
 def rollout(model: Formulation, start: Float[Tensor, "B 13"], steps: int) -> Float[Tensor, "B rows 13"]:
     """States from a start, nothing but gravity and contact acting."""
-    path = model.rollout(start, start.new_zeros(len(start), steps, 6))
-    return torch.cat((path.positions, path.velocities), dim=-1)
+    return model.rollout(start, start.new_zeros(len(start), steps, 6)).states
 
 
 def predict_tosses(model: Formulation, tosses: Tosses) -> Float[Tensor, "N rows 13"]:
@@ -54,7 +53,7 @@ def write_tosses(path: Path | str, predicted: Float[Tensor, "N rows 13"], tosses
     """Write `state` and `offsets` as the file of the recorded tosses has them."""
     path = Path(path)
     if path.suffix != ".npz":
-        raise ValueError(f"{path} must end in .npz.")
+        raise ValueError(f"{path}: expected a name that ends in .npz")
     offsets = np.concatenate(([0], np.cumsum(tosses.steps.numpy() + 1)))
     state = in_file_units(predicted, tosses.steps, tosses.half_width)
     replace(path, lambda file: np.savez_compressed(file, state=state, offsets=offsets))

@@ -2,29 +2,15 @@
 
 import json
 import math
-import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
-
-def replace(path: str | Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a file beside `path`, bring it to the disk, and put it in its place in one step.
-
-    Beside it, because a move from another file system is a copy, of which a kill leaves a part.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.part")
-    with beside.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
+from lcplearn.datasets.files import replace
 
 
 def copy(source: str | Path, path: str | Path) -> None:

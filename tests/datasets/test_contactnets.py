@@ -1,16 +1,13 @@
 """The converter of the published tosses, against the shared files made from the same tosses."""
 
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
 from real_data import real_data
 
-from lcplearn.datasets import read_cube_slides
-from lcplearn.datasets.contactnets import convert, final_slide, main, read_toss
+from lcplearn.datasets.contactnets import convert, final_slide, read_toss
 
 
 def record(file: dict[str, np.ndarray], rows: str, number: int) -> np.ndarray:
@@ -19,7 +16,7 @@ def record(file: dict[str, np.ndarray], rows: str, number: int) -> np.ndarray:
 
 
 def test_the_five_raw_files_give_the_shared_rows():
-    """Issue, section 3: to 1e-12."""
+    """To 1e-12."""
     tosses, slides = convert(real_data("contactnets_raw"))
     with np.load(real_data("cube_tosses.npz")) as file:
         expected_tosses = dict(file)
@@ -88,26 +85,6 @@ def test_a_toss_without_a_flat_fast_long_end_has_no_slide():
     assert final_slide(bump).start_row == 13
 
 
-def test_one_command_makes_files_that_the_reader_takes(tmp_path):
-    (tmp_path / "raw").mkdir()
-    for number in (0, 2, 10, 11):
-        torch.save(toss(rows=20 + number), tmp_path / "raw" / f"{number}.pt")
-    command = [sys.executable, "-m", "lcplearn.datasets.contactnets", str(tmp_path / "raw"), "--out"]
-    done = subprocess.run([*command, str(tmp_path / "data")], capture_output=True, text=True, check=True)
-    assert done.stderr == ""
-    assert "4 tosses" in done.stdout
-    data = read_cube_slides(tmp_path / "data" / "cube_slides.npz", training_slides=3, validation_slides=1)
-    assert sorted([*data.train.steps.tolist(), *data.validation.steps.tolist(), *data.test.steps.tolist()]) == [
-        19,
-        21,
-        29,
-        30,
-    ]
-    with np.load(tmp_path / "data" / "cube_tosses.npz", allow_pickle=False) as file:
-        assert file["source_id"].tolist() == [0, 2, 10, 11]
-        assert file["state"].shape == (20 + 22 + 30 + 31, 13)
-
-
 class Payload:
     """Runs code when unpickled without care."""
 
@@ -140,11 +117,9 @@ def test_a_file_that_is_no_tensor_is_explained_and_not_run(tmp_path, content):
         read_toss(tmp_path / "0.pt")
 
 
-def test_the_command_ends_with_one_sentence_and_no_traceback(tmp_path, capsys):
-    with pytest.raises(SystemExit, match="1"):
-        main([str(tmp_path), "--out", str(tmp_path / "out")])
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+def test_tosses_that_are_missing_or_have_no_slide_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"expected toss files 0\.pt, 1\.pt"):
+        convert(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"7\.pt: no such file"):
         read_toss(tmp_path / "7.pt")
     torch.save(toss(height=2.0), tmp_path / "0.pt")

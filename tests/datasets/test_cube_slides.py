@@ -120,8 +120,8 @@ NAN = arrays()["data"] * np.where(np.arange(6) == 2, np.nan, 1.0)
         ({"offsets": np.array([0, 10, 11, 30])}, "offsets: record 1 has 1 rows, expected at least 2"),
         ({"offsets": np.array([0.0, 30.0])}, "offsets: expected at least two integers, got float64"),
         ({"offsets": np.array([0, 10, 20, 30])}, "training_slides, validation_slides: expected .* got 3 and 1"),
-        ({"dt": np.array(0.0)}, "dt: expected one positive number, got 0.0"),
-        ({"g": np.array(["9.81"])}, "g: expected one positive number"),
+        ({"dt": np.array(0.0)}, "dt: expected a positive number, got 0.0"),
+        ({"g": np.array(["9.81"])}, "g: expected a positive number"),
         ({"data": np.array([{}], dtype=object)}, r"arrays of Python objects \(pickles\) are not read"),
     ],
 )

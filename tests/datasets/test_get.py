@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from real_data import real_data
 
-from lcplearn.datasets import contactnets, get
+from lcplearn.datasets import contactnets, cube_slides, get
 
 
 def git(*arguments: object) -> str:
@@ -75,7 +75,7 @@ def test_one_command_makes_both_files_of_a_clone_and_prints_licence_and_place(pu
 
 def test_without_a_network_one_sentence_says_what_to_do(published, tmp_path, monkeypatch, capsys):
     _, source = published
-    monkeypatch.setitem(get.FILES, "slides", (contactnets.SLIDES_FILE, source._replace(url="file:///nowhere")))
+    monkeypatch.setitem(get.FILES, "slides", (cube_slides.FILE, source._replace(url="file:///nowhere")))
     with pytest.raises(SystemExit) as stop:
         get.main(["slides", "--out", str(tmp_path / "out")])
     assert stop.value.code == 1

@@ -30,6 +30,10 @@ def test_whole_numbers_are_read_as_float64(tmp_path: Path) -> None:
     assert data.truth == {"mu": 1.0}
 
 
+def test_a_true_number_may_be_0(tmp_path: Path) -> None:
+    assert read(tmp_path, mu=0.0).truth == {"mu": 0.0}
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
@@ -42,8 +46,8 @@ def test_whole_numbers_are_read_as_float64(tmp_path: Path) -> None:
         ({"friction": np.zeros((2, 3))}, r"friction: expected numbers of shape \[2, 3, 2\]"),
         ({"steps": np.array([1.0, 2.0])}, r"steps: expected integers of shape \[2\], got float64"),
         ({"steps": np.array([0, 4])}, "steps: expected numbers from 1 to 3"),
-        ({"dt": 0.0}, "dt: expected one positive number, got 0.0"),
-        ({"mu": np.ones(2)}, "mu: expected one positive number"),
+        ({"dt": 0.0}, "dt: expected a positive number, got 0.0"),
+        ({"mu": np.ones(2)}, "mu: expected a finite number"),
     ],
 )
 def test_a_bad_file_is_explained_in_one_sentence(tmp_path: Path, changes: dict[str, np.ndarray], sentence: str) -> None:

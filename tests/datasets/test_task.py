@@ -5,6 +5,7 @@ import torch
 
 from lcplearn.datasets import Recordings, Task
 from lcplearn.scenes import LINE, Drive
+from lcplearn.scenes.space import POSE
 
 
 def part(steps: int = 3, forces: int = 3, columns: int = 2, lengths: tuple[int, ...] = (3, 2)) -> Recordings:
@@ -39,3 +40,12 @@ def test_states_that_are_not_finite_and_a_wrong_time_step_are_refused() -> None:
         Task("mine", LINE, 0.1, part(), part(), bad)
     with pytest.raises(ValueError, match=r"^dt: expected a positive number, got 0\.0"):
         Task("mine", LINE, 0.0, part(), part(), part())
+
+
+def test_a_quaternion_that_is_no_rotation_is_refused() -> None:
+    states = POSE.origin().repeat(1, 3, 1)
+    still = Recordings(states, Drive(torch.zeros(1, 2, 6, dtype=torch.float64)), torch.tensor([2]))
+    Task("mine", POSE, 0.1, still, still, still)
+    states[0, 1, 3:7] = 0.0
+    with pytest.raises(ValueError, match=r"^train\.states: expected a quaternion of norm 1, got one of norm 0"):
+        Task("mine", POSE, 0.1, still, still, still)

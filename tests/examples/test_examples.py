@@ -7,12 +7,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from hydra.errors import HydraException
 from real_data import real_data
 
 from lcplearn.command_line import prepare
 from lcplearn.lcp import methods, solve
 from lcplearn.train import CONF
 from lcplearn.training.settings import SettingsError
+from lcplearn.training.vocabulary import explain
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -124,3 +126,6 @@ def test_own_configuration_is_found_and_checked(tmp_path):
         prepare([*own, "+data.outlier=1"], CONF)
     with pytest.raises(SettingsError, match=r"--config-dir nowhere is not a folder"):
         prepare(["--config-dir=nowhere"], CONF)
+    with pytest.raises(HydraException) as error:
+        prepare(["--config-dir=extending/conf", "model=clipd"], CONF)
+    assert explain(str(error.value), CONF) == "There is no model=clipd; did you mean 'clipped'?"

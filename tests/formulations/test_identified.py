@@ -8,13 +8,13 @@ from typing import ClassVar
 import pytest
 import torch
 from torch import Tensor
-from training.helpers import QUIET
+from training.helpers import QUIET, short_fit
 
 import lcplearn
 from lcplearn.datasets import Recordings, Task, simulate_sliding_block
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.domains import NOT_NEGATIVE, Domain
-from lcplearn.formulations import MLP, Formulation, Identified, Physical
+from lcplearn.formulations import MLP, Formulation, Identified, Physical, build
 from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
 from lcplearn.scenes.scene import Mode, Moving
 from lcplearn.scenes.space import Space
@@ -75,8 +75,8 @@ def test_a_spring_and_its_friction_are_learned_with_the_loop_closed(tmp_path: Pa
         given=task.given,
         learn={"stiffness": 10.0, "mu": 0.05},
     )
-    fitted = fit(model, task, loss={"rollout": 1.0}, horizon=10, epochs=80, optimizer=Optimizer(lbfgs_after=60),
-                 folder=tmp_path, trainer=QUIET)  # fmt: skip
+    fitted = short_fit(model, task, tmp_path, loss={"rollout": 1.0}, horizon=10, epochs=80,
+                       optimizer=Optimizer(lbfgs_after=60), trainer=QUIET)  # fmt: skip
     assert fitted.metrics is not None
     assert fitted.metrics["stiffness_error"] <= 1e-5
     assert fitted.metrics["mu_error"] <= 1e-7
@@ -166,3 +166,10 @@ def test_a_checkpoint_from_before_identified_still_loads(tmp_path: Path) -> None
         saved = {"class": "lcplearn.formulations.structured.Physical", "arguments": arguments}
         torch.save({"formulation": saved, "state_dict": state}, tmp_path / "old.ckpt")
         assert lcplearn.load(tmp_path / "old.ckpt").physical_parameters() == pytest.approx(expected)
+
+
+def test_models_without_structure_see_positions_where_motion_depends_on_them() -> None:
+    spring = simulate_spring_block(trajectories=1, length=2, long_length=2)
+    table = simulate_sliding_block(trajectories=1, length=2, long_length=2)
+    assert [build(MLP, task).inputs for task in (spring, table)] == [3, 2]
+    assert build(MLP, spring, positions=False).inputs == 2

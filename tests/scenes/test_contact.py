@@ -1,7 +1,7 @@
 """Contacts: every solution is held against Coulomb's law over all contacts, against enumeration and differences."""
 
 import itertools
-import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,7 +12,10 @@ from real_data import real_data
 from scenes.contact_scenes import DT, boxes, polygons, violation
 from torch import Tensor
 
-from lcplearn.scenes.contact import Contacts, _flatten, closing_speed, compiled_contacts, contact_step, find, rebound
+from lcplearn.scenes.contact import Contacts, _flatten, closing_speed, compiled_contacts, contact_step, rebound
+from lcplearn.scenes.contact_solve import _iterate, find
+from lcplearn.scenes.contact_solve import solve as solve_in_torch
+from lcplearn.scenes.friction_lcp import Answer, Problem
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -22,15 +25,28 @@ pytestmark = pytest.mark.usefixtures("double_precision")
 def test_what_the_needed_rows_give_solves_the_law_of_all_contacts(seed):
     torch.set_default_dtype(torch.float64)
     for scene in (polygons(30, seed), boxes(30, seed), boxes(30, seed, compliance=1e-3)):
-        step = contact_step(*scene, DT)
-        right = step.solved & step.settled
-        assert right.double().mean() >= 0.95
-        # the iteration leaves 1e-10 of the free velocity; what has one LCP leaves rounding
-        directions = scene[0].tangents.shape[-2]
-        tolerance = 1e-12 if directions == 1 else 1e-8
-        # what is written as at rest may have been computed to sink by what its compliance allows
-        sinking = (scene[0].compliance.amax(-1) * step.normal_impulse.sum(-1)) * step.at_rest
-        assert (violation(*scene, step) - tolerance - 2.0 * sinking)[right].amax() < 0.0
+        step = contact_step(*scene, DT, rest=False)  # which writes 0 for a velocity that compliance leaves
+        right, wrong = step.solved & step.settled, violation(*scene, step)
+        assert (right & (wrong < 1e-12)).sum() >= 29  # of 60,000 boxes one creeps
+        assert wrong[right].amax() < 1e-6
+
+
+def test_rows_of_all_contacts_give_the_same_velocity():
+    problem, _ = _flatten(*boxes(200, 8, compliance=1e-3), DT)  # which makes it unique
+    needed, _ = find(problem, None, rest=False)
+    everything = _iterate(problem)
+    assert (everything.settled & everything.solved).all()
+    assert (needed.velocity - everything.velocity).abs().amax() < 1e-11
+
+
+def test_a_body_that_slides_and_spins_on_four_corners_settles_without_compliance():
+    """Any three corners can carry it; the iteration must not jump from three to three."""
+    contacts, free, mass = boxes(1500, 9)
+    level = (contacts.gap < 1e-12).sum(-1) == 4
+    spin = torch.tensor([1.0, 0.3, 0.0, 0.0, 0.0, 3.0])
+    step = contact_step(Contacts(*(x[level] for x in contacts)), free[level] + spin, mass[level], DT)
+    assert level.sum() > 200
+    assert (step.solved & step.settled).all()
 
 
 def enumerated(contacts: Contacts, free: Tensor, mass: Tensor) -> Tensor:
@@ -189,33 +205,45 @@ def published(name: str, data: dict) -> tuple[Contacts, Tensor, Tensor]:
     return Contacts(nothing, rows[:, 0], rows[:, 1:], mu, nothing, nothing), free, mass
 
 
-def test_published_friction_problems_obey_the_law_of_the_cone():
+def test_all_published_friction_problems_obey_the_law_of_the_cone():
     data = np.load(real_data("lcp_cases.npz"))
-    names = [key.removeprefix("mu/") for key in data.files if key.startswith("mu/") and data[key].size < 30]
-    assert len(names) > 15
-    right = {}
+    names = [key.removeprefix("mu/") for key in data.files if key.startswith("mu/")]
+    assert len(names) == 21
     for name in names:
         contacts, free, mass = published(name, data)
         step = contact_step(contacts, free, mass, DT)
+        assert step.solved, name
+        assert step.settled, name
         scale = max(float(free.abs().amax()), float(step.normal_impulse.amax()), 1.0)
-        if step.solved & step.settled:
-            assert violation(contacts, free, mass, step) < 1e-7 * scale, name
-        right[name] = bool(step.solved & step.settled)
-    assert math.fsum(right.values()) >= 0.8 * len(names), right
+        assert violation(contacts, free, mass, step) < 1e-10 * scale, name
 
 
 @pytest.mark.parametrize("compliance", [0.0, 1e-3])
-def test_the_compiled_step_is_that_of_torch(compliance):
+@pytest.mark.parametrize("scene", [polygons, boxes])
+def test_the_compiled_step_and_its_gradient_are_those_of_torch(scene, compliance):
     pytest.importorskip("numba")
-    for scene in (polygons(60, 11), boxes(60, 12, compliance=compliance)):
-        problem, _ = _flatten(*scene, DT)
-        compiled, compiled_rest = compiled_contacts(torch.device("cpu")).solve(problem, True)
-        with torch.no_grad():
-            found, at_rest = find(problem, None, True)
-        assert (compiled.solved == found.solved).all()
-        assert (compiled.settled == found.settled).all()
-        assert (compiled_rest == at_rest).all()
-        right = found.solved & found.settled
-        torch.testing.assert_close(compiled.velocity[right], found.velocity[right], rtol=0, atol=1e-12)
-        if compliance:  # else loads are not unique; friction never is
-            torch.testing.assert_close(compiled.normal[right], found.normal[right], rtol=0, atol=1e-11)
+    contacts, free, mass = scene(60, 11)
+    contacts = contacts._replace(compliance=torch.full_like(contacts.gap, compliance))
+    problem, _ = _flatten(contacts, free, mass, DT)
+    draw = torch.Generator().manual_seed(1)
+    weights = torch.randn(free.shape, generator=draw), torch.randn(contacts.tangents.shape[:-1], generator=draw)
+
+    def both(solve: Callable) -> tuple[Answer, Tensor, list[Tensor]]:
+        inputs = Problem(*(x.clone().requires_grad_() for x in problem))
+        answer, at_rest = solve(inputs)
+        loss = (weights[0] * answer.velocity).sum()
+        if compliance:  # else loads are not unique, nor what friction of each contact
+            loss = loss + (weights[1] * answer.friction).sum() + answer.normal.square().sum()
+        return answer, at_rest, list(torch.autograd.grad(loss, inputs))
+
+    kernel = compiled_contacts(torch.device("cpu"))
+    compiled, compiled_rest, gradients = both(lambda inputs: kernel.solve(inputs, True))
+    found, at_rest, expected = both(lambda inputs: solve_in_torch(inputs, None, True))
+    assert (compiled.solved & compiled.settled & found.solved & found.settled).all()
+    assert (compiled_rest == at_rest).all()
+    torch.testing.assert_close(compiled.velocity, found.velocity, rtol=0, atol=1e-12)
+    if compliance:
+        torch.testing.assert_close(compiled.normal, found.normal, rtol=0, atol=1e-11)
+    close = 1e-9 if compliance else 1e-11  # a small compliance makes loads unique, and sensitive
+    for mine, wanted in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(mine, wanted, rtol=0, atol=close * float(1.0 + wanted.abs().amax()))

@@ -65,3 +65,15 @@ def test_what_is_no_state_of_the_space_is_refused_by_name():
         POSE.split(torch.zeros(3, 12))
     with pytest.raises(ValueError, match="positions: expected as many as velocities"):
         Space(("x",), ("v", "w"))
+
+
+def test_a_quaternion_of_rounded_digits_is_normalised_and_a_wrong_one_refused():
+    state = POSE.origin()
+    state[3:7] = torch.tensor([0.7071, 0.0, 0.7071, 0.0])
+    turned = POSE.normalised(state)
+    assert turned[3:7].norm().item() == pytest.approx(1.0, abs=1e-15)
+    assert torch.equal(POSE.normalised(POSE.origin()), POSE.origin())
+    with pytest.raises(ValueError, match=r"^state: expected a quaternion of norm 1, got one of norm 2$"):
+        POSE.normalised(torch.cat((state[:3], 2.0 * turned[3:7], state[7:])))
+    line = torch.tensor([3.0, 4.0], dtype=torch.float64)
+    assert LINE.normalised(line) is line

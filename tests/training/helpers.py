@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from lcplearn.datasets import Task, simulate_sliding_block
 from lcplearn.training import Optimizer, Result, fit
@@ -24,10 +26,12 @@ def tiny_data(**arguments: Any) -> Task:
     return small_data(test_length=20, long_length=20, **arguments)
 
 
-def short_fit(model: Any, data: Task, folder: Path, **arguments: Any) -> Result:
+def short_fit(model: Any, data: Task, folder: Path, *, pictures: bool = False, **arguments: Any) -> Result:
+    """Train for a few epochs; pictures take longer than that, so that only tests which look at them draw any."""
     chosen: dict[str, Any] = {"epochs": 4, "optimizer": Optimizer(lbfgs_after=2, lbfgs_iterations=3)}
     chosen |= {"trainer": QUIET | {"check_val_every_n_epoch": 1}} | arguments
-    return fit(model, data, folder=folder, **chosen)
+    with nullcontext() if pictures else mock.patch("lcplearn.training.figures.draw", return_value={}):
+        return fit(model, data, folder=folder, **chosen)
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -18,8 +18,10 @@ from lcplearn.formulations import FORMULATIONS, Formulation, build
 from lcplearn.formulations.pushing import PushModel
 from lcplearn.scenes.scene import Drive
 from lcplearn.scenes.space import POSE
-from lcplearn.training import settings as checks
 from lcplearn.training.optimizer import Optimizer
+from lcplearn.training.settings import SettingsError, check, check_torchrun
+from lcplearn.training.signatures import signature
+from lcplearn.training.vocabulary import TRAINER, explain
 
 CONF = ROOT / "conf"
 
@@ -52,7 +54,7 @@ EVERY = [choice for choice in EVERY if choice not in PUSHES]
 @pytest.fixture(scope="module")
 def tasks() -> dict[str, Task]:
     """By a part of the names of its configurations; one of a sliding block is for everything else."""
-    state = torch.zeros(1, 2, 13, dtype=torch.float64)
+    state = torch.eye(13, dtype=torch.float64)[3].expand(1, 2, 13)  # at rest, not turned
     one = Recordings(state, Drive(torch.zeros(1, 1, 6, dtype=torch.float64)), torch.tensor([1]))
     given = {"half_width": 0.05, "mass": 0.4, "gravity": 9.81, "inertia": 8e-4, "mu": 0.2, "restitution": 0.1}
     cube = Task(name="tosses", space=POSE, dt=0.01, train=one, validation=one, test=one, given=given)
@@ -70,7 +72,7 @@ def tasks() -> dict[str, Task]:
 @pytest.mark.parametrize("choice", EVERY)
 def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, tasks: dict[str, Task]) -> None:
     chosen = settings(*choice.split())
-    checks.check(chosen, CONF)
+    check(chosen, CONF)
     asked = instantiate(chosen["model"], _partial_=True, _convert_="all")
     task = next((task for name, task in tasks.items() if name in choice), tasks["sliding_block"])
     assert isinstance(build(asked.func, task, **asked.keywords), Formulation)
@@ -80,7 +82,7 @@ def test_every_configuration_passes_the_check_and_builds_its_model(choice: str, 
 @pytest.mark.parametrize("choice", PUSHES)
 def test_every_model_of_pushes_passes_the_check_and_is_built(choice: str) -> None:
     chosen = settings("data=pushes", choice)
-    checks.check(chosen, CONF)
+    check(chosen, CONF)
     triangle = {"vertices": [[0.0, 0.0], [0.15, 0.0], [0.0, 0.15]], "com": [0.05, 0.05], "mass": 1.5}
     assert isinstance(instantiate(chosen["model"], **triangle, _convert_="all"), PushModel)
 
@@ -103,31 +105,34 @@ def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
     [
         ("+modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
         ("+model.inital_mu=0.2", "Unknown setting 'model.inital_mu'; did you mean 'model.initial_mu'?"),
-        ("model.initial_mu=abc", "model.initial_mu must be float, got 'abc'."),
-        ("model.b_network=3", "model.b_network must be bool, got 3."),
-        ("trainer.max_epochs=two", "trainer.max_epochs must be int or None, got 'two'."),
+        ("model.initial_mu=abc", "model.initial_mu: expected float, got 'abc'"),
+        ("model.b_network=3", "model.b_network: expected bool, got 3"),
+        ("trainer.max_epochs=two", "trainer.max_epochs: expected int or None, got 'two'"),
         ("+trainer.max_epoch=2", "Unknown setting 'trainer.max_epoch'; did you mean 'trainer.max_epochs'?"),
-        ("loss.prediction=-1", "loss.prediction must be finite and at least 0, got -1."),
+        ("loss.prediction=-1", "loss.prediction: expected a finite number of at least 0, got -1"),
         ("+loss.huber=1", "Unknown setting 'loss.huber'; known are loss.complementarity"),
-        ("loss.prediction=0", "All loss weights are zero"),
-        ("loss.horizon=0", "loss.horizon must be at least 1, got 0."),
+        ("loss.prediction=0", "loss: expected a positive weight"),
+        ("loss.horizon=0", "loss.horizon: expected at least 1, got 0"),
         ("batch_size=64", "LBFGS needs the full batch: set batch_size=null, or optimizer=adam."),
-        ("trainer.max_epochs=0", "trainer.max_epochs must be at least 1, got 0."),
-        ("trainer.check_val_every_n_epoch=null", "trainer.check_val_every_n_epoch must be at least 1, got None."),
-        ("patience=-1", "patience must be at least 1, or null for never, got -1."),
-        ("seed=-1", "seed must be at least 0 and below 2^32, got -1."),
+        ("trainer.max_epochs=0", "trainer.max_epochs: expected at least 1, got 0"),
+        ("trainer.check_val_every_n_epoch=null", "trainer.check_val_every_n_epoch: expected at least 1, got None"),
+        ("patience=-1", "patience: expected at least 1, or null for never, got -1"),
+        ("seed=-1", "seed: expected at least 0 and below 2^32, got -1"),
         ("+model.dt=0.1", "Unknown setting 'model.dt'"),
-        ("data.dt=-0.1", "data.dt must be positive, got -0.1."),
-        ("data.noise=-1", "data.noise must be at least 0, got -1."),
-        ("model=mlp model.width=0", "model.width must be positive, got 0."),
-        ("optimizer.lr=0", "optimizer.lr must be positive, got 0."),
-        ("loss.horizon=101", "loss.horizon=101 is longer than the recordings: data.length=100."),
+        ("data.dt=-0.1", "data.dt: expected a positive number, got -0.1"),
+        ("data.noise=-1", "data.noise: expected at least 0, got -1"),
+        ("model=mlp model.width=0", "model.width: expected a positive number, got 0"),
+        ("optimizer.lr=0", "optimizer.lr: expected a positive number, got 0"),
+        ("loss.horizon=101", "loss.horizon: expected at most data.length=100, got 101"),
         ("trainer.devices=9999", "trainer.devices=9999 would start 9999 processes on"),
-        ("trainer.precision=32-true", "trainer.precision must be 64-true, as sticking is judged at 1e-12 m/s; got 32"),
+        (
+            "trainer.precision=32-true",
+            "trainer.precision: expected 64-true, as sticking is judged at 1e-12 m/s, got 32",
+        ),
         ("+lr=1", "Unknown setting 'lr'; did you mean 'optimizer.lr'?"),
         ("+epochs=3", "Unknown setting 'epochs'; did you mean 'trainer.max_epochs'?"),
-        ("seed=true", "seed must be int, got True."),
-        ("threads=0", "threads must be at least 1, got 0."),
+        ("seed=true", "seed: expected int, got True"),
+        ("threads=0", "threads: expected at least 1, got 0"),
         ("ckpt_path=nope.ckpt", "ckpt_path=nope.ckpt is not a file; checkpoints are named runs/DATE_TIME/last.ckpt."),
         ("model=direct data.friction=null", "model=direct needs friction labels: set data.friction=physical"),
         ("data=cube_slides +data.friction=slack", "Unknown setting 'data.friction'"),
@@ -139,36 +144,51 @@ def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
     ],
 )
 def test_a_mistake_gets_one_sentence_with_a_suggestion(overrides: str, message: str) -> None:
-    with pytest.raises(checks.SettingsError) as error:
-        checks.check(settings(*overrides.split()), CONF)
+    with pytest.raises(SettingsError) as error:
+        check(settings(*overrides.split()), CONF)
     assert str(error.value).startswith(message)
     assert "\n" not in str(error.value)
 
 
 def test_a_missing_checkpoint_is_compared_with_those_that_are_there(tmp_path: Path) -> None:
     (tmp_path / "last.ckpt").touch()
-    with pytest.raises(checks.SettingsError, match=r"did you mean .*last\.ckpt"):
-        checks.check(settings(f"ckpt_path={tmp_path / 'lst.ckpt'}"), CONF)
+    with pytest.raises(SettingsError, match=r"did you mean .*last\.ckpt"):
+        check(settings(f"ckpt_path={tmp_path / 'lst.ckpt'}"), CONF)
 
 
 @pytest.mark.parametrize("overrides", ["trainer.strategy=ddp", "trainer.devices=2", "trainer.devices=[0,1]"])
 def test_a_sweep_refuses_processes_that_would_start_it_again(overrides: str) -> None:
     chosen = settings(*overrides.split())
-    checks.check(chosen, CONF)
-    with pytest.raises(checks.SettingsError, match=r"use trainer\.strategy=ddp_fork"):
-        checks.check(chosen, CONF, multirun=True)
+    check(chosen, CONF)
+    with pytest.raises(SettingsError, match=r"use trainer\.strategy=ddp_fork"):
+        check(chosen, CONF, multirun=True)
     for allowed in ("trainer.devices=1", "trainer.devices=[0]", "trainer.strategy=ddp_fork trainer.devices=2"):
-        checks.check(settings(*allowed.split()), CONF, multirun=True)
+        check(settings(*allowed.split()), CONF, multirun=True)
 
 
 @pytest.mark.parametrize("more", ["", "devices=2", "strategy=ddp", "strategy=ddp_fork devices=2"])
 def test_processes_of_torchrun_that_would_each_train_alone_are_refused(more: str) -> None:
     chosen = settings(*(f"trainer.{setting}" for setting in more.split()))
-    with pytest.raises(checks.SettingsError, match=r"started 2 processes: set trainer\.strategy=ddp and .*devices=2"):
-        checks.check(chosen, CONF, processes=2)
+    with pytest.raises(SettingsError, match=r"started 2 processes: set trainer\.strategy=ddp and .*devices=2"):
+        check(chosen, CONF, processes=2)
     together = ["trainer.strategy=ddp", "trainer.devices=2"]
-    checks.check(settings(*together), CONF, processes=2)
-    checks.check(settings(*together, "+trainer.num_nodes=3"), CONF, processes=6)
+    check(settings(*together), CONF, processes=2)
+    check(settings(*together, "+trainer.num_nodes=3"), CONF, processes=6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("trainer.strategy=ddp", "torchrun's processes need one folder: add hydra.run.dir=runs/NAME."),
+        ("-m seed=0,1", "torchrun trains one run: sweep (-m) without it, with trainer.strategy=ddp_fork."),
+    ],
+)
+def test_processes_of_torchrun_that_would_write_two_runs_are_refused(arguments: str, sentence: str) -> None:
+    with pytest.raises(SettingsError) as error:
+        check_torchrun(arguments.split())
+    assert str(error.value) == sentence
+    check_torchrun(["trainer.strategy=ddp", "hydra.run.dir=runs/pair"])
+    check_torchrun(["--cfg", "job"])
 
 
 @pytest.mark.parametrize(
@@ -201,15 +221,15 @@ def test_processes_of_torchrun_that_would_each_train_alone_are_refused(more: str
 def test_hydras_messages_become_sentences_with_a_suggestion(overrides: str, sentence: str) -> None:
     with pytest.raises(HydraException) as error:
         settings(overrides)
-    assert checks.explain(str(error.value), CONF) == sentence
+    assert explain(str(error.value), CONF) == sentence
 
 
 def test_signatures_are_read_without_importing_their_modules() -> None:
-    found = checks.signature("lcplearn.formulations.baselines.MLP")
+    found = signature("lcplearn.formulations.baselines.MLP")
     assert found is not None
     assert {"dt", "space", "width", "depth", "activation"} <= set(found)
-    assert checks.signature("lcplearn.formulations.slack.NoSuchClass") is None
-    assert checks.signature("no_such_package.module.Class") is None
-    trainer = checks.signature(checks.TRAINER)
+    assert signature("lcplearn.formulations.slack.NoSuchClass") is None
+    assert signature("no_such_package.module.Class") is None
+    trainer = signature(TRAINER)
     assert trainer is not None
     assert "max_epochs" in trainer

@@ -34,8 +34,8 @@ def test_the_structured_model_finds_mass_and_friction_to_machine_precision(tmp_p
     """README: velocity RMSE <= 1e-8, stick 1, false stick 0, rollout <= 1e-6, mu and mass error <= 1e-7."""
     data = small_data(trajectories=10, length=60)
     model = Structured(dt=data.dt)
-    metrics = fit(model, data, loss={"prediction": 1.0}, epochs=160, folder=tmp_path / "run",
-                  optimizer=Optimizer(lbfgs_after=100), trainer=QUIET).metrics  # fmt: skip
+    metrics = short_fit(model, data, tmp_path / "run", epochs=160, optimizer=Optimizer(lbfgs_after=100),
+                        trainer=QUIET).metrics  # fmt: skip
     assert metrics is not None
     assert metrics["velocity_rmse"] <= 1e-8
     assert metrics["stick_accuracy"] == 1.0
@@ -47,7 +47,7 @@ def test_the_structured_model_finds_mass_and_friction_to_machine_precision(tmp_p
 
 def test_a_run_leaves_figures_checkpoints_settings_and_pictures(tmp_path: Path) -> None:
     data = small_data()
-    result = short_fit(Structured(dt=data.dt), data, tmp_path / "run")
+    result = short_fit(Structured(dt=data.dt), data, tmp_path / "run", pictures=True)
     names = {path.name for path in result.folder.iterdir()}
     assert names >= {"best.ckpt", "last.ckpt", "metrics.json", "config.yaml"}
     assert names >= {"one_step_map.png", "rollouts.png", "error_over_horizon.png"}
@@ -195,7 +195,7 @@ def test_annealing_leaves_the_plateau_where_no_sample_slips(tmp_path: Path) -> N
     for epochs in (0, 100):
         model = Physical(dt=data.dt, initial_mu=5.0, initial_mass=1.5, learn_mass=False)
         optimizer = Optimizer(lbfgs_after=140, anneal_epochs=epochs)
-        fit(model, data, epochs=160, optimizer=optimizer, folder=tmp_path / str(epochs), trainer=QUIET)
+        short_fit(model, data, tmp_path / str(epochs), epochs=160, optimizer=optimizer, trainer=QUIET)
         errors[epochs] = abs(model.physical_parameters()["mu"] - 0.4)
     assert errors[0] == pytest.approx(4.6)
     assert errors[100] < 1e-6
@@ -213,7 +213,7 @@ def test_a_logger_of_another_kind_gets_the_figures_of_training_and_of_the_test(t
 def test_tensorboard_shows_losses_modes_residuals_parameters_figures_and_the_table(tmp_path: Path) -> None:
     data = small_data()
     logger = TensorBoardLogger(tmp_path, name="", version="tensorboard", default_hp_metric=False)
-    short_fit(Structured(dt=data.dt), data, tmp_path / "run", logger=logger)
+    short_fit(Structured(dt=data.dt), data, tmp_path / "run", logger=logger, pictures=True)
     events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
     tags = events.Reload().Tags()
     assert set(tags["scalars"]) >= {

@@ -15,6 +15,7 @@ import lcplearn
 from lcplearn import predict
 from lcplearn.datasets import Task
 from lcplearn.datasets.cube_slides import COLUMNS
+from lcplearn.datasets.inputs import read_inputs
 from lcplearn.formulations import Direct, Physical, Structured
 from lcplearn.training.metrics import evaluate
 
@@ -66,6 +67,7 @@ def test_a_csv_prediction_equals_the_rollout(checkpoint: Path, tmp_path: Path) -
     assert [float(row["time_s"]) for row in rows] == pytest.approx([k * model.dt for k in range(len(FORCES) + 1)])
     assert rows[0]["mode"] == ""
     assert {row["mode"] for row in rows[1:]} <= {"stick", "slip"}
+    assert [row["solved"] for row in rows] == ["", *["1"] * len(FORCES)]
     assert picture.stat().st_size > 5000
 
 
@@ -77,6 +79,7 @@ def test_an_npz_batch_predicts_all_its_trajectories(checkpoint: Path, tmp_path: 
     with np.load(tmp_path / "out.npz") as found:
         assert np.array_equal(found["velocities"], expected.velocities[..., 0].detach().numpy())
         assert np.array_equal(found["mode"], expected.mode[..., 0].numpy())
+        assert found["solved"].all()
     with pytest.raises(SystemExit, match=r"one trajectory, not 2; write \.npz instead"):
         predict.main([str(checkpoint), "--input", str(tmp_path / "in.npz"), "--output", str(tmp_path / "out.csv")])
 
@@ -85,7 +88,7 @@ def test_a_model_of_measured_friction_asks_for_its_columns(needs_friction: Path,
     with pytest.raises(SystemExit, match="needs measured friction: the columns friction_plus and friction_minus"):
         predict.main([str(needs_friction), "--input", str(forces_csv(tmp_path))])
     path = forces_csv(tmp_path, "force,friction_plus,friction_minus", ["1.0,0.0,1.0", "2.0,0.0,2.0"])
-    found = predict.predict(lcplearn.load(needs_friction), predict.read_inputs(path))
+    found = predict.predict(lcplearn.load(needs_friction), read_inputs(path))
     assert found.velocities.shape == (3, 1)
 
 
@@ -104,18 +107,18 @@ def test_scoring_the_test_recordings_gives_the_figures_of_the_run(checkpoint: Pa
     ("header", "rows", "message"),
     [
         ("time,Force", None, "has no column 'force'; it has time, Force"),
-        ("force", ["1.0", "x"], "line 3: force must be a number, got 'x'"),
-        ("force", ["1.0", "nan"], "forces must be finite numbers"),
-        ("force", [""], "forces must have at least one step"),
+        ("force", ["1.0", "x"], "line 3: force: expected a number, got 'x'"),
+        ("force", ["1.0", "nan"], "forces: expected finite numbers"),
+        ("force", [""], "forces: expected at least one step"),
         ("force,friction_plus,friction_minus", ["1.0,2.0"], "line 2 has 2 cells, but the header 3"),
         ("force", ["1,5"], "line 2 has 2 cells, but the header 1; decimals have a point, not a comma"),
         ("force;x", ["1;2"], "has no column 'force'; it has force;x"),
-        ("time,force", ["0.0,1", '0.05,"1,5"'], "line 3: force must be a number, got '1,5'; decimals have a point"),
+        ("time,force", ["0.0,1", '0.05,"1,5"'], "line 3: force: expected a number, got '1,5'; decimals have a point"),
         ("force", ["1", "", "2"], "line 3 is empty, but each line is one time step"),
         ("force,force", ["1,2"], "line 1: there are several columns 'force'"),
-        ("force", ["1_000"], "line 2: force must be a number, got '1_000'"),
+        ("force", ["1_000"], "line 2: force: expected a number, got '1_000'"),
         ("time_s,force", ["0,1", "0.01,1"], "has time steps of 0.01 s, but the model was trained for 0.05 s"),
-        ("time,force", ["0,1", "0.05,1", "0.2,1"], "time must rise by equal steps"),
+        ("time,force", ["0,1", "0.05,1", "0.2,1"], "time: expected instants at equal steps"),
     ],
 )
 def test_a_wrong_input_file_gets_one_sentence(
@@ -130,10 +133,10 @@ def test_a_wrong_input_file_gets_one_sentence(
 def test_a_csv_file_as_spreadsheets_write_it_is_read(tmp_path: Path) -> None:
     path = tmp_path / "forces.csv"
     path.write_bytes("\ufeffforce\r\n1.5\r\n".encode())
-    assert predict.read_inputs(path).forces.tolist() == [[1.5]]
+    assert read_inputs(path).forces.tolist() == [[1.5]]
     path.write_bytes(b"PK\x03\x04\xff\xfe")
     with pytest.raises(ValueError, match="is not a CSV file"):
-        predict.read_inputs(path)
+        read_inputs(path)
 
 
 @pytest.mark.parametrize(("shape", "steps"), [((3,), (3,)), ((3, 1), (3,)), ((2, 3), (2, 3)), ((2, 3, 1), (2, 3))])
@@ -141,7 +144,7 @@ def test_forces_with_a_last_axis_of_one_are_what_rollout_takes(
     shape: tuple[int, ...], steps: tuple[int, ...], tmp_path: Path
 ) -> None:
     np.savez(tmp_path / "in.npz", forces=np.ones(shape))
-    assert predict.read_inputs(tmp_path / "in.npz").forces.shape == (*steps, 1)
+    assert read_inputs(tmp_path / "in.npz").forces.shape == (*steps, 1)
 
 
 def test_an_npz_input_of_another_time_step_is_refused(checkpoint: Path, tmp_path: Path) -> None:
@@ -215,8 +218,10 @@ def test_steps_without_a_solution_are_said(tmp_path: Path, capsys: pytest.Captur
     state = {f"model.{name}": value.double() for name, value in state.items()}
     torch.save({"formulation": saved, "state_dict": state}, tmp_path / "unsolvable.ckpt")
     (tmp_path / "forces.csv").write_text("force\n1\n2\n")
-    predict.main([str(tmp_path / "unsolvable.ckpt"), "--input", str(tmp_path / "forces.csv")])
+    out = tmp_path / "motion.csv"
+    predict.main([str(tmp_path / "unsolvable.ckpt"), "--input", str(tmp_path / "forces.csv"), "--output", str(out)])
     assert "2 of all steps without a verified solution" in capsys.readouterr().out
+    assert [row["solved"] for row in csv.DictReader(out.read_text().splitlines())] == ["", "0", "0"]
 
 
 def test_a_checkpoint_imports_no_scene_that_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,19 +238,37 @@ def test_a_checkpoint_imports_no_scene_that_is_not_trusted(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize(
+    ("name", "state", "velocity"),
+    [
+        ("baselines.Affine", {"weight": torch.tensor([1.0, 0.5]), "bias": torch.tensor(0.25)}, 1.0 + 0.5 * 0.2 + 0.25),
+        ("structured.Physical", {"log_mu": torch.tensor(0.5).log(), "log_mass": torch.tensor(2.0).log()}, 0.61),
+    ],
+)
+def test_checkpoints_of_version_0_1_predict_as_they_did(
+    name: str, state: dict[str, torch.Tensor], velocity: float, tmp_path: Path
+) -> None:
+    """From 1 m/s, under 2 N for 0.1 s; classes stood elsewhere, parameters had other shapes or names."""
+    saved = {"class": f"lcplearn.formulations.{name}", "arguments": {"dt": 0.1, "gravity": 9.8}}
+    state = {f"model.{key}": value.double() for key, value in state.items()}
+    torch.save({"formulation": saved, "state_dict": state}, tmp_path / "old.ckpt")
+    start, force = torch.tensor([0.0, 1.0]), torch.tensor([2.0])
+    assert lcplearn.load(tmp_path / "old.ckpt").step(start, force)[1].item() == pytest.approx(velocity)
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"forces": np.zeros((2, 0))}, "forces must have at least one step"),
-        ({"forces": np.array(["a"])}, "forces must be numbers, got text"),
+        ({"forces": np.zeros((2, 0))}, "forces: expected at least one step"),
+        ({"forces": np.array(["a"])}, "forces: expected numbers, got text"),
         ({"forces": np.array([{}])}, "pickles"),
-        ({"state": np.zeros((5, 2))}, r"state must have shape \[3, 2\] or \[2\], got \[5, 2\]"),
-        ({"friction": np.zeros((3, 4))}, r"friction must have shape \[3, 4, 2\]"),
+        ({"state": np.zeros((5, 2))}, r"state: expected shape \[3, 2\] or \[2\], got \[5, 2\]"),
+        ({"friction": np.zeros((3, 4))}, r"friction: expected shape \[3, 4, 2\]"),
     ],
 )
 def test_a_wrong_npz_input_gets_one_sentence(changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", **({"forces": np.zeros((3, 4))} | changes))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=message) as error:
-        predict.read_inputs(tmp_path / "in.npz")
+        read_inputs(tmp_path / "in.npz")
     assert "\n" not in str(error.value)
 
 
@@ -272,7 +295,7 @@ def test_files_that_are_no_checkpoint_or_no_data_get_one_sentence(checkpoint: Pa
         (["nope.ckpt", "--input", str(text)], "There is no checkpoint nope.ckpt"),
         ([str(text), "--input", str(text)], "is not a checkpoint that can be loaded safely"),
         ([str(checkpoint), "--input", "nope.csv"], "There is no input file nope.csv"),
-        ([str(checkpoint), "--input", str(checkpoint)], "must end in .csv or .npz"),
+        ([str(checkpoint), "--input", str(checkpoint)], "expected a name that ends in .csv or .npz"),
         ([str(checkpoint), "--score", str(tmp_path / "other.npz")], "has time steps of 0.1 s"),
         ([str(checkpoint), "--score", str(tmp_path / "short.npz")], "positions, velocities, dt missing; got forces"),
         ([str(checkpoint), "--score", str(text)], "expected an NPZ file"),

@@ -59,12 +59,6 @@ def test_runs_side_by_side_train_as_one_by_one_end_with_the_comparison_and_resum
     assert (resumed.metrics["velocity_rmse"] or 0.0) < figures["velocity_rmse"]
 
 
-def test_a_mistake_in_a_run_beside_others_ends_the_sweep_in_one_sentence(tmp_path: Path) -> None:
-    done = train(tmp_path, "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "threads=0,-1", *SHORT)
-    assert done.returncode == 1
-    assert done.stderr.strip() in [f"threads must be at least 1, got {threads}." for threads in (0, -1)]
-
-
 def test_ctrl_c_ends_runs_side_by_side_without_a_traceback(tmp_path: Path) -> None:
     command = [sys.executable, str(ROOT / "train.py"), "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
                "seed=0,1", "trainer.max_epochs=50000", "optimizer=adam", "patience=null", *SMALL]  # fmt: skip
@@ -95,19 +89,3 @@ def test_processes_of_torchrun_train_as_one_would_and_write_one_run(tmp_path: Pa
     assert names == {".hydra", "config.yaml", "best.ckpt", "last.ckpt", "metrics.json", "tensorboard"}
     figures = json.loads((folder / "metrics.json").read_text())
     assert figures["velocity_rmse"] == pytest.approx(error, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "sentence"),
-    [
-        (TWO, "torchrun's processes need one folder: add hydra.run.dir=runs/NAME."),
-        (["-m", "seed=0,1"], "torchrun trains one run: sweep (-m) without it, with trainer.strategy=ddp_fork."),
-    ],
-)
-def test_processes_of_torchrun_that_would_write_two_runs_are_refused(
-    tmp_path: Path, overrides: list[str], sentence: str
-) -> None:
-    done = train(tmp_path, *overrides, WORLD_SIZE="2", TORCHELASTIC_RUN_ID="none")
-    assert done.returncode == 1
-    assert done.stderr.strip() == sentence
-    assert not (tmp_path / "runs").exists()

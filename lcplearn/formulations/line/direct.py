@@ -9,12 +9,12 @@ from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from lcplearn.datasets.recordings import Windows
-from lcplearn.formulations.line.decomposed import decomposed_error
-from lcplearn.formulations.line.formulation import LineFormulation, Prediction, first_step
+from lcplearn.formulations.line.decomposed import Decomposed
+from lcplearn.formulations.line.formulation import Numbers, Pairs, first_step
 from lcplearn.formulations.networks import features
 
 
-class KnownFriction(LineFormulation):
+class KnownFriction(Decomposed):
     """Decompose the next velocity into parts affine in velocity, force and a known friction vector.
 
     (v+, v-) = f(v, u) + G y,   f = F (v, u dt) + f_0,   y = friction * dt
@@ -28,18 +28,11 @@ class KnownFriction(LineFormulation):
         self.f_bias = nn.Parameter(torch.zeros(2, dtype=torch.float64))
         self.G = nn.Parameter(torch.zeros(2, 2, dtype=torch.float64))
 
-    def free_parts(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch 2"]:
+    def free_parts(self, velocity: Numbers, force: Numbers) -> Pairs:
         """f(v, u): the parts of the velocity without friction [m/s]."""
         return features(velocity, force, self.dt) @ self.f_weight.mT + self.f_bias
 
-    def velocity_parts(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch 2"]:
+    def velocity_parts(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Pairs:
         """Predict (v+, v-) [m/s] from measured friction [N].
 
         Raises:
@@ -55,10 +48,6 @@ class KnownFriction(LineFormulation):
         """Beside the usual: complementarity (friction * (v+, v-))^2 and nonnegativity max(0, -(v+, v-))^2."""
         more = {"complementarity": self._complementarity_error, "nonnegativity": self._nonnegativity_error}
         return super().errors() | more
-
-    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
-        """Squared error of (v+, v-) after the first step [m^2/s^2]."""
-        return decomposed_error(self.velocity_parts(*first_step(windows)), windows)
 
     def _complementarity_error(self, windows: Windows) -> Float[Tensor, " B"]:
         velocity, force, friction = first_step(windows)
@@ -82,12 +71,3 @@ class Direct(KnownFriction):
     """
 
     needs_friction: ClassVar[bool] = True
-
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
-        parts = self.velocity_parts(velocity, force, friction)
-        return parts[..., 0] - parts[..., 1], None

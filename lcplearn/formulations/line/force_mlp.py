@@ -1,9 +1,8 @@
 """The friction force as a network."""
 
-from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.formulations.line.formulation import LineFormulation, Prediction
+from lcplearn.formulations.line.formulation import LineFormulation, Numbers, Pairs, Prediction
 from lcplearn.formulations.networks import features, log_parameter, network
 
 
@@ -40,18 +39,11 @@ class ForceMLP(LineFormulation):
         self.log_mass = log_parameter("initial_mass", initial_mass)
         self.net = network(2, 1, width=width, depth=depth, activation=activation)
 
-    def friction_force(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
+    def friction_force(self, velocity: Numbers, force: Numbers) -> Numbers:
         """Predicted friction force [N]."""
         # The network's output is an impulse of order one: its division by dt keeps it learnable when dt is small.
         impulse: Tensor = self.net(features(velocity, force, self.dt))
         return impulse[..., 0] / self.dt
 
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
+    def predict(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Prediction:
         return velocity + (force + self.friction_force(velocity, force)) * self.dt / self.log_mass.exp(), None

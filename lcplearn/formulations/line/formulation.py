@@ -1,5 +1,7 @@
 """The adapter of models that know one scalar velocity: it unpacks states, and advances the position."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +13,8 @@ from lcplearn.lcp.solution import LCPSolution
 from lcplearn.scenes.scene import STICK_SPEED, Drive, Mode, Step
 from lcplearn.scenes.space import LINE
 
+Numbers = Float[Tensor, "*batch"]
+Pairs = Float[Tensor, "*batch 2"]
 Prediction = tuple[Tensor, LCPSolution | None]
 
 
@@ -29,12 +33,7 @@ class LineFormulation(Formulation):
         super().__init__(space=LINE, dt=dt, given={"gravity": positive("gravity", gravity)})
         self.gravity = float(gravity)
 
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
+    def predict(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Prediction:
         """Predict the velocity one step later.
 
         Args:
@@ -47,12 +46,7 @@ class LineFormulation(Formulation):
         """
         raise NotImplementedError
 
-    def next_velocity(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
+    def next_velocity(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Numbers:
         """Velocity after a step [m/s], see `predict`."""
         return self.predict(velocity, force, friction)[0]
 
@@ -64,17 +58,25 @@ class LineFormulation(Formulation):
         return Step(state, mode, solution, None if solution is None else solution.solved)
 
     def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
-        after = self.next_velocity(*first_step(windows))
-        return (after - windows.states[:, 1, 1]).square()
+        return step_error(self.next_velocity, windows)
 
     def rollout_error(self, windows: Windows) -> Float[Tensor, "B k"]:
-        # As the base class has it, without the positions and modes, which no prediction reads.
-        velocity, force, friction = windows.states[:, 0, 1], windows.drive.force[..., 0], windows.drive.friction
-        predicted = []
-        for k in range(windows.valid.shape[1]):
-            velocity = self.next_velocity(velocity, force[:, k], None if friction is None else friction[:, k])
-            predicted.append(velocity)
-        return (torch.stack(predicted, dim=1) - windows.states[:, 1:, 1]).square()
+        return path_error(self.next_velocity, windows)
+
+
+def step_error(next_velocity: Callable[..., Tensor], windows: Windows) -> Float[Tensor, " B"]:
+    """`Formulation.prediction_error` of what has velocities, without positions and modes, which it does not read."""
+    return (next_velocity(*first_step(windows)) - windows.states[:, 1, 1]).square()
+
+
+def path_error(next_velocity: Callable[..., Tensor], windows: Windows) -> Float[Tensor, "B k"]:
+    """`Formulation.rollout_error` where no velocity depends on a position."""
+    velocity, force, friction = windows.states[:, 0, 1], windows.drive.force[..., 0], windows.drive.friction
+    predicted = []
+    for k in range(windows.valid.shape[1]):
+        velocity = next_velocity(velocity, force[:, k], None if friction is None else friction[:, k])
+        predicted.append(velocity)
+    return (torch.stack(predicted, dim=1) - windows.states[:, 1:, 1]).square()
 
 
 def first_step(windows: Windows) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -3,19 +3,17 @@
 from typing import cast
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import relu
 
-from lcplearn.datasets.recordings import Windows
-from lcplearn.formulations.line.decomposed import decomposed_error
-from lcplearn.formulations.line.formulation import LineFormulation, Prediction, first_step
+from lcplearn.formulations.line.decomposed import Decomposed
+from lcplearn.formulations.line.formulation import Numbers, Pairs
 from lcplearn.formulations.networks import features, network
 
 INITIAL_BIAS = -0.01  # [m/s] negative: a small stick band from the start, with both outputs alive outside it
 
 
-class ReLU(LineFormulation):
+class ReLU(Decomposed):
     """Predict the decomposed velocity by rectified affine maps, or by a rectified network.
 
     v_{k+1} = v+ - v-,   (v+, v-) = relu(W h + bias),   h = (v, u dt) or the last hidden layer of a network
@@ -43,24 +41,6 @@ class ReLU(LineFormulation):
             output.weight[1] = -output.weight[0]
             output.bias.fill_(INITIAL_BIAS)
 
-    def velocity_parts(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Float[Tensor, "*batch 2"]:
+    def velocity_parts(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Pairs:
         """Predict (v+, v-) >= 0 [m/s]."""
         return relu(self.net(features(velocity, force, self.dt)))
-
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
-        parts = self.velocity_parts(velocity, force)
-        return parts[..., 0] - parts[..., 1], None
-
-    def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
-        """Squared error of (v+, v-) after the first step [m^2/s^2]."""
-        return decomposed_error(self.velocity_parts(*first_step(windows)), windows)

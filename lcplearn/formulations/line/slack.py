@@ -1,11 +1,9 @@
 """Velocity affine in slack friction (the notes' 3.1.2), deployed as its own LCP."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from lcplearn.formulations.line.direct import KnownFriction
-from lcplearn.formulations.line.formulation import Prediction
+from lcplearn.formulations.line.formulation import Numbers, Pairs, Prediction
 from lcplearn.lcp.solve import solve_lcp
 
 
@@ -27,11 +25,6 @@ class Slack(KnownFriction):
         with torch.no_grad():
             self.G.copy_(torch.eye(2))  # unit mass: the first predictions are solvable LCPs
 
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
+    def predict(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Prediction:
         solution = solve_lcp(self.G, self.free_parts(velocity, force))
         return solution.w[..., 0] - solution.w[..., 1], solution

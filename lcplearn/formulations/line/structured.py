@@ -9,7 +9,7 @@ from torch.nn.functional import softplus
 
 from lcplearn.datasets.recordings import Windows
 from lcplearn.domains import positive
-from lcplearn.formulations.line.formulation import LineFormulation, Prediction, first_step
+from lcplearn.formulations.line.formulation import LineFormulation, Numbers, Pairs, Prediction, first_step
 from lcplearn.formulations.networks import features, log_parameter, network
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.violation import violation
@@ -29,9 +29,7 @@ class FrictionLCP(LineFormulation):
     Source: Pfrommer's "LCP Notes" (2019), section 3.2; NOTES 6.3.
     """
 
-    def free_velocity(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
+    def free_velocity(self, velocity: Numbers, force: Numbers) -> Numbers:
         """b: the velocity after a step without friction [m/s]."""
         raise NotImplementedError
 
@@ -39,20 +37,15 @@ class FrictionLCP(LineFormulation):
         """a: velocity change per friction impulse [1/kg]; > 0."""
         raise NotImplementedError
 
-    def impulse_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+    def impulse_limit(self, velocity: Numbers) -> Float[Tensor, "*#batch"]:
         """c: the largest friction impulse of one step [N s]; > 0."""
         raise NotImplementedError
 
-    def velocity_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+    def velocity_limit(self, velocity: Numbers) -> Float[Tensor, "*#batch"]:
         """a c: the largest change of velocity that friction can make in one step [m/s]."""
         return self.inverse_mass() * self.impulse_limit(velocity)
 
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
+    def predict(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Prediction:
         b = self.free_velocity(velocity, force)
         signed = torch.stack((b, -b), dim=-1)
         if self.temperature > 0.0:
@@ -120,9 +113,7 @@ class Structured(FrictionLCP):
         self.b_net = network(2, 1, width=width, depth=depth, activation="tanh") if b_network else None
         self.c_net = network(1, 1, width=width, depth=depth, activation="tanh") if c_network else None
 
-    def free_velocity(
-        self, velocity: Float[Tensor, "*batch"], force: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch"]:
+    def free_velocity(self, velocity: Numbers, force: Numbers) -> Numbers:
         inputs = features(velocity, force, self.dt)
         b = inputs @ self.b_weight + self.b_bias
         return b if self.b_net is None else b + self.b_net(inputs)[..., 0]
@@ -130,7 +121,7 @@ class Structured(FrictionLCP):
     def inverse_mass(self) -> Float[Tensor, ""]:
         return self.log_a.exp()
 
-    def impulse_limit(self, velocity: Float[Tensor, "*batch"]) -> Float[Tensor, "*#batch"]:
+    def impulse_limit(self, velocity: Numbers) -> Float[Tensor, "*#batch"]:
         log_c = self.log_c if self.c_net is None else self.log_c + self.c_net(velocity[..., None])[..., 0]
         return log_c.exp()
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lcplearn.domains import NOT_NEGATIVE, check, positive
-from lcplearn.formulations.line.formulation import LineFormulation, Prediction
+from lcplearn.formulations.line.formulation import LineFormulation, Numbers, Pairs, Prediction
 from lcplearn.formulations.networks import features
 from lcplearn.lcp.solve import solve_lcp
 
@@ -44,6 +44,11 @@ class FreeLCP(LineFormulation):
         self.b_weight = nn.Parameter(torch.ones(2, dtype=torch.float64))
         self.b_bias = nn.Parameter(torch.zeros((), dtype=torch.float64))
         self.a = nn.Parameter(torch.ones((), dtype=torch.float64))
+        self.start_matrix()
+
+    def start_matrix(self) -> None:
+        """Make the parameters of G."""
+        raise NotImplementedError
 
     def noisy(self, values: list[float] | list[list[float]]) -> nn.Parameter:
         """Make a parameter of `values` plus the initial noise."""
@@ -54,12 +59,7 @@ class FreeLCP(LineFormulation):
         """G, from the learned parameters."""
         raise NotImplementedError
 
-    def predict(
-        self,
-        velocity: Float[Tensor, "*batch"],
-        force: Float[Tensor, "*batch"],
-        friction: Float[Tensor, "*batch 2"] | None = None,
-    ) -> Prediction:
+    def predict(self, velocity: Numbers, force: Numbers, friction: Pairs | None = None) -> Prediction:
         inputs = features(velocity, force, self.dt)
         solution = solve_lcp(self.matrix(), inputs @ self.f_weight.mT + self.f_bias)
         impulse = self.a * (solution.z[..., 0] - solution.z[..., 1])
@@ -69,10 +69,7 @@ class FreeLCP(LineFormulation):
 class Traditional(FreeLCP):
     """Learn G without any constraint; the LCP may have no solution or several."""
 
-    def __init__(
-        self, *, dt: float, gravity: float = 9.81, initial_mu: float = 0.1, initial_noise: float = 0.03
-    ) -> None:
-        super().__init__(dt=dt, gravity=gravity, initial_mu=initial_mu, initial_noise=initial_noise)
+    def start_matrix(self) -> None:
         self.G = self.noisy((torch.tensor(SYMMETRIC) + torch.tensor(SKEW)).tolist())
 
     def matrix(self) -> Float[Tensor, "3 3"]:
@@ -103,6 +100,8 @@ class PSD(FreeLCP):
     ) -> None:
         super().__init__(dt=dt, gravity=gravity, initial_mu=initial_mu, initial_noise=initial_noise)
         self.shift = positive("shift", shift)
+
+    def start_matrix(self) -> None:
         self.L = self.noisy([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # L L' = SYMMETRIC
 
     def matrix(self) -> Float[Tensor, "3 3"]:
@@ -112,26 +111,12 @@ class PSD(FreeLCP):
 class PSDSkew(PSD):
     """Learn G = L L' + H - H' + shift I: always solvable, and it can come close to the friction matrix.
 
-    With shift > 0 the symmetric part is positive definite, so the LCP has one solution for every f.
-
-    Args:
-        dt: Time step [s].
-        gravity: Acceleration of gravity [m/s^2].
-        initial_mu: Friction coefficient at the start; > 0.
-        initial_noise: Standard deviation of the noise on the initial entries of f, L and H; >= 0.
-        shift: Lower bound of the eigenvalues of G's symmetric part; > 0.
+    With shift > 0 the symmetric part is positive definite, so the LCP has one solution for every f. Arguments are those
+    of `PSD`; H, too, starts with noise.
     """
 
-    def __init__(
-        self,
-        *,
-        dt: float,
-        gravity: float = 9.81,
-        initial_mu: float = 0.1,
-        initial_noise: float = 0.03,
-        shift: float = 1e-3,
-    ) -> None:
-        super().__init__(dt=dt, gravity=gravity, initial_mu=initial_mu, initial_noise=initial_noise, shift=shift)
+    def start_matrix(self) -> None:
+        super().start_matrix()
         self.H = self.noisy([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])  # H - H' = SKEW
 
     def matrix(self) -> Float[Tensor, "3 3"]:

@@ -1,0 +1,69 @@
+"""How the compiled functions of scenes are compiled, cached, and called from each other.
+
+A big function that others need is compiled once and called by its address: inlined it would be compiled in each.
+"""
+
+from functools import cache
+from hashlib import sha256
+from inspect import unwrap
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from lcplearn.lcp import pivoting
+
+LARGEST = 1.7976931348623157e308  # of all doubles
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+
+
+def compiled(function: Any, cached: bool = False) -> Any:
+    """numba.njit; with a cache if asked for and a cache folder can be written."""
+    function = unwrap(function)  # in tests jaxtyping wraps every function
+    try:
+        return numba.njit(cache=cached, **_OPTIONS)(function)
+    except RuntimeError:  # "cannot cache function: no locator available"
+        return numba.njit(**_OPTIONS)(function)
+
+
+def fingerprint(*files: str) -> str:
+    """Of the sources of a compiled function, in this folder and beside it.
+
+    numba watches one file alone, but a closure's values are part of a function's key.
+    """
+    here = Path(__file__).parent
+    sources = [*sorted(here.glob("*.py")), *(here.parent / name for name in ("friction_lcp.py", *files))]
+    return sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+
+
+def address_of(function: Any) -> int:
+    """Where the code of a compiled function is; it must have been called with one set of types."""
+    (code,) = function.overloads.values()
+    return int(code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name))
+
+
+def _call_code(_: Any, address: Any, arguments: Any) -> Any:
+    """Call compiled code at an address with a tuple of arguments of the types that it was compiled for."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        values = cgutils.unpack_tuple(builder, args[1])
+        kind = ir.FunctionType(ir.VoidType(), [x.type for x in values])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)
+        return context.get_dummy_value()
+
+    return types.void(address, arguments), codegen
+
+
+call: Any = intrinsic(_call_code)
+
+
+@cache
+def solver_address() -> int:
+    """Where the layer's compiled solver is."""
+    M, q = torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
+    pivoting.solve_batch(M, q, single_precision=False, max_iter=None)
+    return address_of(pivoting.solve_range)

@@ -1,0 +1,142 @@
+"""A batch of contact problems, compiled: their solution and its gradient as one node of autograd."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
+from lcplearn.scenes.contact_kernel.compiling import address_of, compiled, fingerprint, solver_address
+from lcplearn.scenes.contact_kernel.cone import workspace
+from lcplearn.scenes.contact_kernel.element import parts, solve_element
+from lcplearn.scenes.friction_lcp import Answer, Problem
+
+
+def _make_solve_all(sources: str) -> Any:
+    def _solve_all(
+        address, rest, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, sticks, flags
+    ):
+        sources  # noqa: B018, for the cache
+        B, C, nv = normal.shape
+        T = tangents.shape[2]
+        numbers, part = workspace(C, nv), parts(C)
+        rows, index, active = np.empty((3 * C, nv)), np.empty(C, np.int64), np.empty(C, np.bool_)
+        gram, scale = np.empty((nv, nv)), np.empty(C)
+        for b in range(B):
+            flags[b, 0], flags[b, 1], flags[b, 2] = solve_element(
+                address, C, nv, T, rest, target[b], normal[b], tangents[b], mu[b], compliance[b], free[b], mass[b],
+                numbers, part, rows, index, active, gram, scale, velocity[b], load[b], friction[b], sticks[b],
+            )  # fmt: skip
+
+    return compiled(_solve_all, cached=True)
+
+
+def _make_pull_back_all(sources: str) -> Any:
+    def _pull_back_all(
+        normal, tangents, mu, compliance, free, mass, load, friction, sticks, flags, velocity_, load_, friction_,
+        target_, normal_, tangents_, mu_, compliance_, free_, mass_,
+    ):  # fmt: skip
+        """Gradients, from those of velocity, load and friction, for the contacts that are loaded; the rest are 0."""
+        sources  # noqa: B018, for the cache
+        B, C, nv = normal.shape
+        T = tangents.shape[2]
+        w = 1 + T
+        memory = contact_memory(C, nv, T)
+        rows, rows_, y, y_ = np.empty((w * C, nv)), np.empty((w * C, nv)), np.empty(w * C), np.empty(w * C)
+        stuck, part_mu, soft, index = np.empty(C, np.bool_), np.empty(C), np.empty(C), np.empty(C, np.int64)
+        part_target_, part_mu_, part_soft_ = np.empty(C), np.empty(C), np.empty(C)
+        for b in range(B):
+            if not flags[b, 0]:
+                continue
+            free_[b] = velocity_[b]
+            K = 0
+            for i in range(C):
+                if load[b, i] > 0.0:
+                    index[K], stuck[K], part_mu[K], soft[K] = i, sticks[b, i], mu[b, i], compliance[b, i]
+                    rows[w * K], y[w * K], y_[w * K] = normal[b, i], load[b, i], load_[b, i]
+                    for t in range(T):
+                        rows[w * K + 1 + t] = tangents[b, i, t]
+                        y[w * K + 1 + t], y_[w * K + 1 + t] = friction[b, i, t], friction_[b, i, t]
+                    K += 1
+            if K == 0:
+                continue
+            pull_back_contacts(
+                K, T, nv, rows, y, stuck, part_mu, soft, free[b], mass[b], velocity_[b], y_, memory, free_[b], rows_,
+                part_target_, part_mu_, part_soft_, mass_[b],
+            )  # fmt: skip
+            for i in range(K):
+                j = index[i]
+                target_[b, j], mu_[b, j], compliance_[b, j] = part_target_[i], part_mu_[i], part_soft_[i]
+                normal_[b, j] = rows_[w * i]
+                for t in range(T):
+                    tangents_[b, j, t] = rows_[w * i + 1 + t]
+
+    return compiled(_pull_back_all, cached=True)
+
+
+_solve_all = _make_solve_all(fingerprint())
+_pull_back_all = _make_pull_back_all(fingerprint("contact_gradient.py"))
+
+
+@cache
+def contacts_address() -> int:
+    """Where the compiled solver of contacts is; called as `_solve_all` is."""
+    one, row, rows = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
+    flags = np.empty((1, 3), np.bool_)
+    _solve_all(
+        solver_address(), True, -one, row, rows, one, one, one, one, one.copy(), one.copy(), row.copy(),
+        flags[:, :1].copy(), flags,
+    )  # fmt: skip
+    return address_of(_solve_all)
+
+
+class Solved(NamedTuple):
+    """Numpy arrays of what is found; flags [B, 3] are solved, settled, at rest. Other shapes as in `Answer`."""
+
+    velocity: np.ndarray
+    load: np.ndarray
+    friction: np.ndarray
+    sticks: np.ndarray
+    flags: np.ndarray
+
+
+def solve(problem: Problem, rest: bool) -> tuple[Answer, Tensor]:
+    """The answer, differentiable, and where it is at rest; its slip is not told."""
+    if torch.is_grad_enabled() and any(x.requires_grad for x in problem):
+        velocity, load, friction, sticks, flags = _Contacts.apply(rest, *problem)
+    else:
+        velocity, load, friction, sticks, flags = (torch.from_numpy(x) for x in _solve(problem, rest))
+    solved, settled, at_rest = flags.unbind(-1)
+    return Answer(velocity, load, friction, friction, sticks, solved, settled), at_rest
+
+
+def _solve(problem: Problem, rest: bool) -> Solved:
+    arrays = [x.detach().contiguous().numpy() for x in problem]
+    target, _, tangents, *_, free, _ = arrays
+    found = Solved(
+        np.empty_like(free), np.empty_like(target), np.empty(tangents.shape[:3]), np.empty(target.shape, np.bool_),
+        np.empty((len(free), 3), np.bool_),
+    )  # fmt: skip
+    _solve_all(solver_address(), rest, *arrays, *found)
+    return found
+
+
+class _Contacts(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rest: bool, *problem: Tensor) -> tuple[Tensor, ...]:
+        ctx.found = found = _solve(Problem(*problem), rest)
+        ctx.save_for_backward(*problem)
+        results = tuple(torch.from_numpy(x) for x in found)
+        ctx.mark_non_differentiable(*results[3:])
+        return results
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        given = [x.detach().contiguous().numpy() for x in ctx.saved_tensors]
+        results = [np.zeros(x.shape) for x in given]
+        wanted = [x.contiguous().numpy() for x in gradients[:3]]
+        _pull_back_all(*given[1:], *ctx.found[1:], *wanted, *results)
+        return (None, *(torch.from_numpy(x) for x in results))
