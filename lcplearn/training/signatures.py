@@ -1,11 +1,13 @@
 """What a class or function accepts, read from its source: nothing is imported, so that mistakes are found at once."""
 
 import ast
+import functools
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 
+@functools.cache
 def signature(target: str) -> dict[str, str] | None:
     """Argument names and annotations of a class or function, from its source; None if it can't be found there.
 

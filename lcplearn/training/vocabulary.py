@@ -1,6 +1,7 @@
 """Names that may stand in settings, and the sentence on one that may not: with what was probably meant."""
 
 import difflib
+import functools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -64,6 +65,7 @@ def unknown(key: str, conf: Path) -> str:
     return f"Unknown setting '{key}'; {suggestion(key, top)}"
 
 
+@functools.cache  # a sweep asks for each of its runs
 def vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:
     """Keys of a group's files, and those that its targets accept besides."""
     files = list((conf / group).glob("*.yaml")) if group else [conf / "train.yaml"]
