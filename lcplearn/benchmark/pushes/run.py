@@ -1,7 +1,9 @@
 """`benchmark pushes`: gradients against differences, time of a push, models from few pushes, planning."""
 
 import copy
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,13 +14,21 @@ from lcplearn.benchmark.harness.measuring import interleave
 from lcplearn.benchmark.harness.study import Options, Row, Study, Table
 from lcplearn.benchmark.pushes.planning import plan, wanted_poses
 from lcplearn.datasets.pushes import PushData, read_pushes
-from lcplearn.formulations.pushing import PushModel, Ridge, Supports
+from lcplearn.formulations.pushing import PushMLP, PushModel, Residual, Ridge, Supports
 from lcplearn.formulations.pushing.supports import Latent
 from lcplearn.training.push_figures import animate_push
 from lcplearn.training.push_metrics import errors
 
 COLUMNS = ("right", "milliseconds", "deviation", "success", "seconds", "rollouts")
-NUMBERS = (10, 50, 200)
+NUMBERS = (10, 50, 200, 360)  # of 400: some must be left to judge on
+MODELS: Mapping[str, Callable[..., PushModel]] = {
+    "supports": Supports,
+    "supports + process": Residual,
+    "ellipsoid": partial(Supports, law="ellipsoid", height=False, rim=False),
+    "ridge": Ridge,
+    "MLP": PushMLP,
+}
+FEWEST = 50  # below it there is no rim and no process to learn
 WORTH_SEEING = 20  # a push that turns the object
 STEP = 1e-5  # of differences; logarithms, centimetres and radii
 # What the plant differs by: logarithm of mu_c, height [cm], rim.
@@ -42,6 +52,8 @@ def run(options: Options) -> None:
             row = {"right": right_gradients(model, data, str(case))}
         elif table == "time":
             row = {"milliseconds": milliseconds(model, data, int(case))}
+        elif table == "fit":
+            row = {"seconds": seconds_to_fit(data)}
         elif table == "few":
             row = {"deviation": from_few(data, int(case), str(method), options.seed + int(repeat))}
         else:
@@ -55,8 +67,10 @@ def run(options: Options) -> None:
 def _plan(quick: bool) -> Iterator[tuple[str, str | int, str, int]]:
     yield from (("gradient", name, "", 0) for name in ("mu_c", "height", "pressure x", "pressure y"))
     yield from (("time", batch, "", 0) for batch in (1, 400))
+    yield "fit", 3, "", 0
     for number in NUMBERS[:1] if quick else NUMBERS:
-        yield from (("few", number, method, k) for method in ("supports", "ridge") for k in range(2 if quick else 5))
+        names = [name for name in MODELS if name != "supports + process" or number >= FEWEST]
+        yield from (("few", number, name, k) for name in names for k in range(2 if quick or number > FEWEST else 5))
     for plant in list(PLANTS)[: 1 if quick else None]:
         yield from (("plan", plant, planner, 0) for planner in PLANNERS)
 
@@ -105,11 +119,19 @@ def milliseconds(model: PushModel, data: PushData, batch: int) -> float:
         return 1e3 * interleave({"": call}, 5)[""].wall / batch
 
 
+def seconds_to_fit(data: PushData) -> float:
+    """Wall time of fitting the supports' three numbers, and mu of the surfaces, to all pushes."""
+    began = time.perf_counter()
+    fitted(Supports(**thing(data)), data)
+    return time.perf_counter() - began
+
+
 def from_few(data: PushData, number: int, method: str, seed: int) -> float:
-    """Mean deviation [mm] on all others, learned from some pushes; ten have no rim to learn."""
+    """Mean deviation [mm] on all others, learned from some pushes."""
     order = torch.randperm(len(data.configuration), generator=torch.Generator().manual_seed(seed))
-    model = Ridge(**thing(data)) if method == "ridge" else Supports(**thing(data), rim=number > 10)
-    model = fitted(model, data.take(order[:number]))
+    options = {"rim": False} if method == "supports" and number < FEWEST else {}
+    torch.manual_seed(seed)  # of the network
+    model = fitted(MODELS[method](**thing(data), **options), data.take(order[:number]))
     others = data.take(order[number:])
     missing = set(others.pushes.surface) - set(model.arguments.get("surfaces", others.pushes.surface))
     assert not missing, f"no push on {missing}"
@@ -144,12 +166,19 @@ def _say(study: Study) -> None:
         "How long does a push take?",
         table=Table(("batch", "ms a push"), [(row["case"], row["milliseconds"]) for row in rows("time")]),
     )
+    study.say(
+        "How long does a fit take?",
+        "mu_c, height and rim from 400 end poses, and mu of two surfaces from forces.",
+        table=Table(("numbers", "s"), [(row["case"], row["seconds"]) for row in rows("fit")]),
+    )
     groups: dict[tuple[Any, Any], list[float]] = {}
     for row in rows("few"):
         groups.setdefault((row["method"], row["case"]), []).append(row["deviation"])
     study.say(
         "How many pushes does a model need?",
-        "Mean deviation [mm] on all other pushes: mean, least and largest of the draws.",
+        "Mean deviation [mm] on all other pushes: mean, least and largest of the draws. "
+        f"From fewer than {FEWEST} pushes "
+        "the supports learn mu_c and the height alone.",
         figure=_draw_few(groups),
         table=Table(
             ("model", "pushes", "mean", "least", "largest"),
@@ -177,7 +206,10 @@ def _draw_few(groups: dict[tuple[Any, Any], list[float]]) -> Any:
         spread = [[m - min(v) for m, v in zip(means, found.values(), strict=True)]]
         spread += [[max(v) - m for m, v in zip(means, found.values(), strict=True)]]
         axes[0, 0].errorbar(list(found), means, spread, marker="o", capsize=3, color=f"C{index}", label=method)
-    axes[0, 0].set(xscale="log", xlabel="pushes to learn from", ylabel="mean deviation of all others [mm]")
+    axes[0, 0].set(xscale="log", yscale="log", xlabel="pushes to learn from", ylabel="deviation of all others [mm]")
+    axes[0, 0].set_xticks(NUMBERS, [str(number) for number in NUMBERS])
+    axes[0, 0].set_yticks((1, 1.5, 2, 3, 5, 10), ("1", "1.5", "2", "3", "5", "10"))
+    axes[0, 0].minorticks_off()
     axes[0, 0].grid(alpha=0.3)
     axes[0, 0].legend()
     return figure

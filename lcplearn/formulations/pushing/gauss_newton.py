@@ -13,9 +13,14 @@ def least_deviation(
     start: Float[Tensor, " p"],
     *,
     floor: float,
+    expected: Float[Tensor, " p"],
+    spread: Float[Tensor, " p"],
+    noise: float,
     iterations: int = 20,
 ) -> Iterator[tuple[Float[Tensor, " p"], float]]:
-    """Minimise the mean over a batch of sqrt(|e(x)|^2 + floor^2) by Gauss and Newton.
+    """Minimise the mean of sqrt(|e(x)|^2 + floor^2) over a batch of b, with a weak prior, by Gauss and Newton.
+
+    The prior adds noise / (2 b) * sum ((x - expected) / spread)^2: few errors leave x near what is expected.
 
     Squares are weighted anew by the size of the last errors, and damped where a step does not improve
     (Levenberg and Marquardt).
@@ -24,6 +29,8 @@ def least_deviation(
         linearise: x to errors and their Jacobian.
         start: First x.
         floor: Errors below this do not matter, which makes the loss smooth.
+        expected, spread: Of x, before any error is seen.
+        noise: Size of an error that nothing explains.
         iterations: Calls of `linearise` at most.
 
     Yields:
@@ -34,19 +41,20 @@ def least_deviation(
     for _ in range(iterations):
         error, jacobian = linearise(x)
         size = (error.square().sum(-1) + floor**2).sqrt()
-        loss = float(size.mean())
+        away = (x - expected) / spread
+        loss = float(size.mean() + noise / (2.0 * len(size)) * away.square().sum())
         if loss < best:
             converged = best - loss < 1e-4 * loss
             best, best_x, damping = loss, x, damping / 4.0
             weighted = jacobian / size[:, None, None]
-            curvature = torch.einsum("bip,biq->pq", weighted, jacobian)
-            slope = torch.einsum("bip,bi->p", weighted, error)
+            curvature = torch.einsum("bip,biq->pq", weighted, jacobian) + (noise / spread**2).diag()
+            slope = torch.einsum("bip,bi->p", weighted, error) + noise * away / spread
             yield best_x, best
             if converged:
                 return
         else:
             damping *= 8.0
-        damped = curvature + damping * curvature.diagonal().clamp_min(1e-300).diag()
+        damped = curvature + damping * curvature.diagonal().diag()
         step = torch.linalg.solve(damped, slope).clamp(-1.0, 1.0)
         if float(step.abs().max()) < 1e-5:
             return

@@ -1,11 +1,12 @@
 """A Gaussian process on what varies from push to push, seen through the Jacobian of the rollout."""
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from lcplearn.formulations.pushing.features import Features, near, same
 
 # What varies from push to push: columns of the latent vector, and its standard deviation at the start of learning.
 LATENTS: Mapping[str, tuple[slice, float]] = {
@@ -21,31 +22,6 @@ LENGTHS = {"body": 0.6, "direction": 0.5, "world": 2.0, "heading": 1.0}  # [RADI
 NOISE = 0.8  # [mm] at the start of learning
 SMALL = -4.6  # logarithm of the spread that the prior expects
 Terms = Mapping[str, tuple[str, ...]]
-
-
-class Features(NamedTuple):
-    """What the process knows of a push; lengths in units of RADIUS, axes of the object where not said otherwise.
-
-    Attributes:
-        body: First contact, from the centre of mass.
-        direction: Of the finger.
-        world: Centre of mass in the world.
-        heading: Cosine and sine of the object's angle in the world.
-        edge: Number of the edge.
-        geometry: The support points, sorted; -1 where the whole face bears.
-        surface: Number of the surface.
-    """
-
-    body: Float[Tensor, "b 2"]
-    direction: Float[Tensor, "b 2"]
-    world: Float[Tensor, "b 2"]
-    heading: Float[Tensor, "b 2"]
-    edge: Float[Tensor, "b 1"]
-    geometry: Float[Tensor, "b 6"]
-    surface: Float[Tensor, "b 1"]
-
-
-WIDTHS = (2, 2, 2, 2, 1, 6, 1)
 
 
 class Process(nn.Module):
@@ -70,7 +46,8 @@ class Process(nn.Module):
         scales = torch.tensor([*spreads, *LENGTHS.values(), NOISE], dtype=torch.float64)
         self.log_scales: Tensor
         self.register_buffer("log_scales", scales.log())
-        self.register_buffer("weights", torch.zeros(known, LATENT_COUNT, dtype=torch.float64))
+        self.columns = [k for name in terms for k in range(LATENT_COUNT)[LATENTS[name][0]]]
+        self.register_buffer("weights", torch.zeros(known, len(self.columns)))  # single precision makes files small
 
     def fit(
         self, features: Features, through: Float[Tensor, "b 3 l"], left: Float[Tensor, "b 3"]
@@ -84,53 +61,48 @@ class Process(nn.Module):
         for step in range(self.steps + 1):
             functions = self.functions(features, features, scales)
             covariance = functions["motion"] if direct else _seen(functions, through)
-            noise = (2.0 * scales[-1]).exp() * torch.eye(len(target), dtype=torch.float64)
-            factor = torch.linalg.cholesky(covariance + noise)
-            alpha = torch.cholesky_solve(target, factor)
+            covariance = covariance + (2.0 * scales[-1]).exp() * torch.eye(len(target), dtype=torch.float64)
             prior = ((scales[: -len(LENGTHS) - 1] - SMALL) / 4.0).square().sum() / 2.0
-            loss = 0.5 * (target * alpha).sum() + target.shape[1] * factor.diagonal().log().sum() + prior
-            yield {"log_likelihood": -float(loss.detach())}
-            if step < self.steps:
+            factor = torch.linalg.cholesky(covariance.detach())
+            alpha = torch.cholesky_solve(target, factor)
+            count = target.shape[1]
+            loss = 0.5 * (target * alpha).sum() + count * factor.diagonal().log().sum() + prior.detach()
+            yield {"log_likelihood": -float(loss)}
+            if step < self.steps:  # the derivative by its formula: through the factor it takes three times as long
+                slope = (count * torch.cholesky_inverse(factor) - alpha @ alpha.mT) / 2.0
                 optimizer.zero_grad()
-                loss.backward()
+                torch.autograd.backward((covariance, prior), (slope, None))
                 optimizer.step()
         self.log_scales = scales.detach()
-        self.weights = torch.einsum("bil,bi->bl", through, alpha.detach().reshape(-1, 3))
+        self.weights = torch.einsum("bil,bi->bl", through, alpha.reshape(-1, 3))[:, self.columns].float()
 
     def mean(self, features: Features, known: Features) -> Float[Tensor, "b l"]:
         """Posterior mean of all latents; zero for those without terms."""
-        functions = self.functions(features, known, self.log_scales)
+        weights = torch.zeros(len(known.edge), LATENT_COUNT, dtype=torch.float64)
+        weights[:, self.columns] = self.weights.double()
         found = torch.zeros(len(features.edge), LATENT_COUNT, dtype=torch.float64)
-        for name, function in functions.items():
+        for name, function in self.functions(features, known, self.log_scales).items():
             columns = LATENTS[name][0]
-            found[:, columns] = function @ self.weights[:, columns]
+            found[:, columns] = function @ weights[:, columns]
         return found
 
     def functions(self, a: Features, b: Features, log_scales: Tensor) -> dict[str, Float[Tensor, "na nb"]]:
         """Covariance of each latent between two sets of pushes."""
         lengths = log_scales[-len(LENGTHS) - 1 : -1].exp()
-        configuration = _same(a.geometry, b.geometry) * _same(a.surface, b.surface)
-        contact = _near(a.body, b.body, lengths[0]) * _near(a.direction, b.direction, lengths[1])
+        configuration = same(a.geometry, b.geometry) * same(a.surface, b.surface)
+        contact = near(a.body, b.body, lengths[0]) * near(a.direction, b.direction, lengths[1])
         kinds = {
             "all": torch.ones_like(contact),
-            "edge": _same(a.edge, b.edge),
+            "edge": same(a.edge, b.edge),
             "configuration": configuration,
             "contact": contact,
             "contact*configuration": contact * configuration,
-            "place": _near(a.world, b.world, lengths[2]) * _near(a.heading, b.heading, lengths[3]),
+            "place": near(a.world, b.world, lengths[2]) * near(a.heading, b.heading, lengths[3]),
         }
         spreads = iter((2.0 * log_scales[: -len(LENGTHS) - 1]).exp())
         return {
             name: torch.stack([next(spreads) * kinds[kind] for kind in own]).sum(0) for name, own in self.terms.items()
         }
-
-
-def _near(a: Tensor, b: Tensor, length: Tensor) -> Tensor:
-    return (-0.5 * (a[:, None] - b).square().sum(-1) / length**2).exp()
-
-
-def _same(a: Tensor, b: Tensor) -> Tensor:
-    return ((a[:, None] - b).abs() < 1e-6).all(-1).to(torch.float64)
 
 
 def _seen(functions: Mapping[str, Tensor], through: Tensor) -> Tensor:

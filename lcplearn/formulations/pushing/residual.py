@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lcplearn.formulations.pushing.process import LATENTS, WIDTHS, Features, Process, Terms
-from lcplearn.formulations.pushing.push_model import RADIUS, PushModel, PushPrediction, jacobian
+from lcplearn.formulations.pushing.features import WIDTHS, Features, features
+from lcplearn.formulations.pushing.process import LATENTS, Process, Terms
+from lcplearn.formulations.pushing.push_model import PushModel, PushPrediction, jacobian
 from lcplearn.formulations.pushing.supports import Latent, Supports
-from lcplearn.scenes.pushed_object import rotate
 from lcplearn.scenes.pushes import Outcome, Pushes
 
 MM = 1e3
@@ -31,7 +31,8 @@ class Residual(PushModel):
     Two Gaussian processes over contact, direction, place and configuration are learned from what `Supports` leaves.
     The first is inside the rollout: end poses are linear in its latents through the rollout's Jacobian, and its
     posterior mean goes into the rollout itself. The second corrects end poses alone. The prediction is the mean of
-    both.
+    both, or the second where the latents leave a push without an equilibrium. Forces
+    are those of the supports.
 
     Args:
         vertices, com, mass: The object.
@@ -57,7 +58,7 @@ class Residual(PushModel):
         self.arguments |= {"steps": steps, "learning_steps": learning_steps}
         self.arguments |= {"surfaces": list(surfaces), "known": known}
         self.features: Tensor
-        self.register_buffer("features", torch.zeros(known, sum(WIDTHS), dtype=torch.float64))
+        self.register_buffer("features", torch.zeros(known, sum(WIDTHS)))
         self.inside = Process(INSIDE, known, learning_steps)
         self.beside = Process(BESIDE, known, learning_steps)
 
@@ -74,37 +75,25 @@ class Residual(PushModel):
         left = (MM * self.motion(pushes, outcome.pose) - motion).detach()
         correction = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
         through = torch.cat((jacobian(motion, latent).detach(), correction), -1)
-        features = self._features(pushes)
-        self.features = torch.cat(features, -1)
-        yield from self.inside.fit(features, through, left)
-        yield from self.beside.fit(features, through, left)
+        found = self._features(pushes)
+        self.features = torch.cat(found, -1).float()
+        yield from self.inside.fit(found, through, left)
+        yield from self.beside.fit(found, through, left)
 
     def predict(self, pushes: Pushes) -> PushPrediction:
-        known, features = Features(*self.features.split(WIDTHS, -1)), self._features(pushes)
-        inside, beside = self.inside.mean(features, known), self.beside.mean(features, known)
+        known, found = Features(*self.features.double().split(WIDTHS, -1)), self._features(pushes)
+        inside, beside = self.inside.mean(found, known), self.beside.mean(found, known)
         varied, plain = self.base.predict(pushes, _latent(inside)), self.base.predict(pushes)
-        motion = (self.motion(pushes, varied.pose) + self.motion(pushes, plain.pose)) / 2.0
-        motion = motion + (inside + beside)[:, LATENTS["motion"][0]] / (2.0 * MM)
-        return PushPrediction(self.pose(pushes, motion), varied.force, varied.solved & plain.solved)
+        correction = LATENTS["motion"][0]
+        one = self.motion(pushes, varied.pose) + inside[:, correction] / MM
+        two = self.motion(pushes, plain.pose) + beside[:, correction] / MM
+        # A learned wrench may leave a push without an equilibrium.
+        motion = torch.where(varied.solved[:, None], (one + two) / 2.0, two)
+        return PushPrediction(self.pose(pushes, motion), plain.force, plain.solved)
 
     def _features(self, pushes: Pushes) -> Features:
-        push, thing = pushes.push, self.base.object
-        angle = push.pose[:, 2]
-        contact = push.start + thing.first_touch(push)[:, None] * (push.end - push.start)
-        body = rotate(-angle, contact - push.pose[:, :2])
-        direction = rotate(-angle, push.end - push.start)
-        centre = push.pose[:, :2] + rotate(angle, self.com)
-        corners = pushes.points.nan_to_num(-1.0)
-        order = (1e4 * corners[..., 0] + corners[..., 1]).argsort(-1)
-        return Features(
-            (body - self.com) / RADIUS,
-            direction / direction.norm(dim=-1, keepdim=True),
-            centre / RADIUS,
-            torch.stack((angle.cos(), angle.sin()), -1),
-            thing.outside(body).argmax(-1, keepdim=True).to(torch.float64),
-            corners.gather(1, order[..., None].expand(-1, -1, 2)).flatten(1),
-            torch.tensor([[self.base.surfaces.index(name)] for name in pushes.surface]).to(torch.float64),
-        )
+        surface = torch.tensor([self.base.surfaces.index(name) for name in pushes.surface])
+        return Features(*(part.float().double() for part in features(pushes, self.base.object, surface)))
 
 
 def _latent(x: Float[Tensor, "b m"]) -> Latent:

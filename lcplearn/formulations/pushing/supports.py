@@ -16,7 +16,11 @@ from lcplearn.scenes.pushes import Outcome, Pushes
 GAUSS = (0.5 - math.sqrt(1.0 / 12.0), 0.5 + math.sqrt(1.0 / 12.0))  # two points of Gauss and Legendre on an edge
 INNER = ((2 / 3, 1 / 6, 1 / 6), (1 / 6, 2 / 3, 1 / 6), (1 / 6, 1 / 6, 2 / 3))  # three, of degree two, in a triangle
 FLOOR = 1e-4  # m; below this an error does not matter, which makes the loss smooth
+NOISE = 1e-3  # m; what these mechanics leave over
 HEIGHT = 1e-2  # m; scale of the height
+# Before any push is seen: logarithm of mu_c, height [HEIGHT] (a finger pushes at the order of a centimetre), logit of
+# the rim's share; and their spread.
+EXPECTED, SPREAD = (math.log(0.3), 1.0, 0.0), (0.5, 1.0, 2.0)
 
 
 class Latent(NamedTuple):
@@ -44,7 +48,7 @@ class Supports(PushModel):
 
     The finger's friction mu_c, the height at which the finger pushes, and, where the whole face bears, the share of
     the load at its rim are learned from end poses. mu of a surface does not move an object differently: it is learned
-    from the size of the force.
+    from the size of the force, apart for pushes on three feet and on the whole face.
 
     Args:
         vertices, com, mass: The object.
@@ -79,7 +83,8 @@ class Supports(PushModel):
         self.numbers = nn.Parameter(torch.tensor((math.log(0.3), 0.0, 0.0), dtype=torch.float64))
         self.learned = torch.tensor((True, height, rim)).nonzero()[:, 0]
         self.mu: Tensor
-        self.register_buffer("mu", torch.full((len(surfaces),), 0.3, dtype=torch.float64))
+        # Of each surface, under feet and under the whole face.
+        self.register_buffer("mu", torch.full((len(surfaces), 2), 0.3, dtype=torch.float64))
 
     @property
     def surfaces(self) -> list[str]:
@@ -93,7 +98,9 @@ class Supports(PushModel):
             found["height_mm"] = 1e3 * HEIGHT * height
         if self.arguments["rim"]:
             found["rim"] = 1.0 / (1.0 + math.exp(-rim))
-        return found | {f"mu_{name}": value for name, value in zip(self.surfaces, self.mu.tolist(), strict=True)}
+        for name, (feet, face) in zip(self.surfaces, self.mu.tolist(), strict=True):
+            found |= {f"mu_{name}": feet, f"mu_{name}_face": face}
+        return found
 
     def predict(self, pushes: Pushes, latent: Latent | None = None) -> PushPrediction:
         unknown = sorted(set(pushes.surface) - set(self.surfaces))
@@ -105,7 +112,7 @@ class Supports(PushModel):
         """Numbers from poses, through the rollout, then mu from forces; twice, as mu moves poses by the height."""
         new = [name for name in dict.fromkeys(pushes.surface) if name not in self.surfaces]
         self.arguments["surfaces"] = self.surfaces + new
-        self.mu = torch.cat((self.mu, torch.full((len(new),), 0.3, dtype=torch.float64)))
+        self.mu = torch.cat((self.mu, torch.full((len(new), 2), 0.3, dtype=torch.float64)))
         true, learned = self.motion(pushes, outcome.pose), self.learned
 
         def linearise(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,7 +123,15 @@ class Supports(PushModel):
             return (motion - true).detach(), jacobian(motion, each)[..., learned]
 
         for _ in range(2):
-            for x, loss in least_deviation(linearise, self.numbers.detach()[learned].clone(), floor=FLOOR):
+            found = least_deviation(
+                linearise,
+                self.numbers.detach()[learned].clone(),
+                floor=FLOOR,
+                expected=torch.tensor(EXPECTED, dtype=torch.float64)[learned],
+                spread=torch.tensor(SPREAD, dtype=torch.float64)[learned],
+                noise=NOISE,
+            )
+            for x, loss in found:
                 with torch.no_grad():
                     self.numbers[learned] = x
                 yield {"deviation_mm": 1e3 * loss} | self.physical_parameters()
@@ -124,13 +139,22 @@ class Supports(PushModel):
 
     @torch.no_grad()
     def _fit_mu(self, pushes: Pushes, outcome: Outcome) -> None:
-        """Forces are proportional to mu: the one whose forces sum up to the measured ones, for each surface."""
+        """Forces are proportional to mu: the one whose forces sum up to the measured ones.
+
+        Where a surface has no push on feet, or none on the whole face, one mu stands for both.
+        """
         force = self.predict(pushes).force
         assert force is not None
         on = self._surface(pushes)
         for k in on.unique():
-            measured, predicted = (f[on == k].norm(dim=-1).sum() for f in (outcome.force, force))
-            self.mu[k] *= measured / predicted
+            kinds = {face: (on == k) & (pushes.whole_face == bool(face)) for face in (0, 1)}
+            for face, mine in kinds.items():
+                if bool(mine.any()):
+                    measured, predicted = (f[mine].norm(dim=-1).sum() for f in (outcome.force, force))
+                    self.mu[k, face] *= measured / predicted
+            for face, mine in kinds.items():
+                if not bool(mine.any()):
+                    self.mu[k, face] = self.mu[k, 1 - face]
 
     def _surface(self, pushes: Pushes) -> Tensor:
         return torch.tensor([self.surfaces.index(name) for name in pushes.surface])
@@ -168,7 +192,7 @@ class Supports(PushModel):
         if bool(pushes.whole_face.any()):
             points, weights = self._face(rim.sigmoid())
         loads, levers = plane_fit(points, self.com, weights)
-        mu = self.mu[self._surface(pushes)]
+        mu = self.mu[self._surface(pushes), pushes.whole_face.long()]
         if latent is None:
             return Grip(points, loads, levers, mu, log_mu_c.exp(), height * HEIGHT)
         radius = self.object.radius
