@@ -15,6 +15,7 @@ from lcplearn.lcp.methods import pivoting_kernel
 from lcplearn.lcp.torch_internals import traced, transformed
 from lcplearn.scenes.contact_solve import solve
 from lcplearn.scenes.friction_lcp import Problem
+from lcplearn.scenes.numbers import common_batch, one_batch
 from lcplearn.scenes.scene import Mode
 
 RestitutionLaw = Literal["newton", "continuous"]
@@ -163,21 +164,18 @@ def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple
     """One problem with a single batch dimension, in float64, and the batch dimensions that it stands for."""
     gap, normal, tangents, mu, bounce, compliance = contacts
     shapes = (x.shape[:-k] for x, k in ((gap, 1), (normal, 2), (tangents, 3), (mu, 1), (free, 1), (mass, 1)))
-    batch = torch.broadcast_shapes(*shapes, bounce.shape[:-1], compliance.shape[:-1])
+    batch = common_batch(*shapes, bounce.shape[:-1], compliance.shape[:-1])
     count, nv, directions = normal.shape[-2], normal.shape[-1], tangents.shape[-2]
-
-    def flat(x: Tensor, *shape: int) -> Tensor:
-        return x.expand(*batch, *shape).reshape(batch.numel(), *shape).double()
 
     return (
         Problem(
-            target=flat(bounce - gap / dt, count),
-            normal=flat(normal, count, nv),
-            tangents=flat(tangents, count, directions, nv),
-            mu=flat(mu, count),
-            compliance=flat(compliance, count),
-            free=flat(free, nv),
-            mass=flat(mass, nv),
+            target=one_batch(bounce - gap / dt, batch, count),
+            normal=one_batch(normal, batch, count, nv),
+            tangents=one_batch(tangents, batch, count, directions, nv),
+            mu=one_batch(mu, batch, count),
+            compliance=one_batch(compliance, batch, count),
+            free=one_batch(free, batch, nv),
+            mass=one_batch(mass, batch, nv),
         ),
         batch,
     )

@@ -14,7 +14,22 @@ def as_tensor(value: Number, like: Tensor) -> Tensor:
 
 def stack_numbers(*values: Number, like: Tensor) -> Float[Tensor, "*batch k"]:
     """Numbers side by side in a new last dimension."""
+    if not any(isinstance(x, Tensor) for x in values):
+        return torch.tensor(values, dtype=like.dtype, device=like.device)
     return torch.stack(torch.broadcast_tensors(*(as_tensor(x, like) for x in values)), dim=-1)
+
+
+def common_batch(*shapes: torch.Size) -> torch.Size:
+    """As torch.broadcast_shapes, which takes 20 us."""
+    some = {shape for shape in shapes if shape}
+    return torch.broadcast_shapes(*some) if len(some) > 1 else some.pop() if some else torch.Size()
+
+
+def one_batch(x: Tensor, batch: torch.Size, *shape: int) -> Tensor:
+    """Values [B, *shape] in float64 of what broadcasts to [*batch, *shape]."""
+    if x.shape != (*batch, *shape):
+        x = x.expand(*batch, *shape)
+    return (x if len(batch) == 1 else x.reshape(batch.numel(), *shape)).double()
 
 
 def matvec(matrix: Float[Tensor, "*#batch m n"], vector: Float[Tensor, "*#batch n"]) -> Float[Tensor, "..."]:

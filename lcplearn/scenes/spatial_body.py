@@ -12,7 +12,7 @@ from torch import Tensor
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check, check_numbers
 from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, compiled_contacts, contact_step, rebound
 from lcplearn.scenes.contact_violation import Touch
-from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
+from lcplearn.scenes.numbers import Number, as_tensor, common_batch, matvec, one_batch, stack_numbers
 from lcplearn.scenes.scene import Drive, Step, Trajectory, rollout
 from lcplearn.scenes.space import POSE, Space, rotation_matrix
 
@@ -91,21 +91,21 @@ class SpatialBody:
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one step; the mode is that of each corner."""
-        path = self.fused_rollout(state, drive.map(lambda values: values.unsqueeze(-2)))
-        if path is not None:
-            state = torch.cat((path.positions[..., 1, :], path.velocities[..., 1, :]), dim=-1)
-            return Step(state, path.mode[..., 0, :], None, None if path.solved is None else path.solved[..., 0])
+        found = self._fused(state, drive.force.unsqueeze(-2))
+        if found is not None:
+            states, mode, solved = found
+            return Step(states[..., 1, :], mode[..., 0, :], None, solved[..., 0])
         position, before = POSE.split(state)
         turn = rotation_matrix(position[..., 3:])
         mass = self._mass(state)
         free = self._free_velocity(before, turn, drive.force, mass)
         contacts = self._contacts(position, before, free, turn)
-        found = contact_step(contacts, free, mass, self.dt, polygon=self.polygon, rest=self.rest)
-        moved = POSE.advance(position, found.velocity, self.dt)
+        step = contact_step(contacts, free, mass, self.dt, polygon=self.polygon, rest=self.rest)
+        moved = POSE.advance(position, step.velocity, self.dt)
         # Normalising a quaternion may move its last bit: what rests does not move at all.
-        moved = torch.where(found.at_rest.unsqueeze(-1), moved - moved.detach() + position.detach(), moved)
-        state = torch.cat((moved, found.velocity), dim=-1)
-        return Step(state, found.mode, None, found.solved & found.settled)
+        moved = torch.where(step.at_rest.unsqueeze(-1), moved - moved.detach() + position.detach(), moved)
+        state = torch.cat((moved, step.velocity), dim=-1)
+        return Step(state, step.mode, None, step.solved & step.settled)
 
     def rollout(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Trajectory:
         """As `scene.rollout`."""
@@ -113,22 +113,21 @@ class SpatialBody:
 
     def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
         """The same in one compiled loop, forwards and backwards; None where that can't be: not on the CPU, ..."""
-        force = drive.force
+        found = self._fused(state, drive.force)
+        return None if found is None else Trajectory(*POSE.split(found[0]), *found[1:])
+
+    def _fused(self, state: Tensor, force: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+        """States, modes and whether each step is right of a fused rollout of force [*batch, T, 6]."""
         if self.polygon is not None or compiled_contacts(state.device) is None:
             return None
         if state.dtype is not torch.float64 or force.dtype is not torch.float64:
             return None
         POSE.split(state)
-        mass = self._mass(state)
+        mass, down = self._mass(state), self._gravity(state)
         numbers = (self.radius, self.restitution, self.mu, self.mu if self.mu_impact is None else self.mu_impact)
-        compliance = as_tensor(self.compliance, state) / as_tensor(self.mass, state)
-        given = stack_numbers(*numbers, self.ground, compliance, like=state)
+        given = stack_numbers(*numbers, self.ground, self.compliance / self.mass, like=state)
         shapes = (state.shape[:-1], force.shape[:-2], self.corners.shape[:-2], mass.shape[:-1], given.shape[:-1])
-        down = self._gravity(state)
-        batch = torch.broadcast_shapes(*shapes, down.shape[:-1])
-
-        def flat(x: Tensor, *shape: int) -> Tensor:
-            return x.expand(*batch, *shape).reshape(batch.numel(), *shape).double()
+        batch = common_batch(*shapes, down.shape[:-1])
 
         from lcplearn.scenes.spatial_adjoint import roll_out
         from lcplearn.scenes.spatial_kernel import Options
@@ -141,15 +140,15 @@ class SpatialBody:
                 rest=self.rest,
                 impact_speed=self.impact_speed,
             ),
-            flat(state, 13),
-            flat(force, *force.shape[-2:]),
-            flat(self.corners, self.contacts, 3),
-            flat(mass, 6),
-            flat(given, 6),
-            flat(down, 3),
+            one_batch(state, batch, 13),
+            one_batch(force, batch, *force.shape[-2:]),
+            one_batch(self.corners, batch, self.contacts, 3),
+            one_batch(mass, batch, 6),
+            one_batch(given, batch, 6),
+            one_batch(down, batch, 3),
         )
         states, mode, solved = (x.reshape((*batch, *x.shape[1:])) for x in found)
-        return Trajectory(*POSE.split(states), mode, solved)
+        return states, mode, solved
 
     def touch_at(self, position: Float[Tensor, "*#batch 7"]) -> Touch:
         """Gaps, Jacobians and friction coefficients of the corners at a pose, as at rest there."""
@@ -164,10 +163,9 @@ class SpatialBody:
 
     def _gravity(self, like: Tensor) -> Tensor:
         """Acceleration of gravity as a vector [*batch, 3]."""
-        gravity = as_tensor(self.gravity, like)
-        if gravity.shape[-1:] == (3,):
-            return gravity
-        return torch.stack((torch.zeros_like(gravity), torch.zeros_like(gravity), -gravity), dim=-1)
+        if isinstance(self.gravity, Tensor) and self.gravity.shape[-1:] == (3,):
+            return self.gravity
+        return stack_numbers(0.0, 0.0, -self.gravity, like=like)
 
     def _free_velocity(self, velocity: Tensor, turn: Tensor, force: Tensor, mass: Tensor) -> Tensor:
         linear = velocity[..., :3] + self.dt * (self._gravity(velocity) + force[..., :3] / mass[..., :3])
@@ -193,7 +191,7 @@ class SpatialBody:
         if self.mu_impact is not None:
             share = torch.clamp(closing / self.impact_speed, max=1.0)
             mu = mu + (as_tensor(self.mu_impact, position).unsqueeze(-1) - mu) * share
-        compliance = as_tensor(self.compliance, position) / as_tensor(self.mass, position)
+        compliance = as_tensor(self.compliance / self.mass, position)
         return Contacts(
             gap=gap,
             normal=normal,

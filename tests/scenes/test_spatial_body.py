@@ -130,6 +130,24 @@ def test_a_flat_box_slides_straight_as_the_block_in_one_dimension():
     assert (path.velocities[..., 1:].abs() < 1e-9).all()
 
 
+def test_halving_dt_halves_the_error_of_a_slide_that_curves():
+    """Across a slope of 20 degrees, against the block's equations v' = g_x - mu g_z v / |v| in tiny steps."""
+    flat, gravity = box_corners(torch.tensor([0.05, 0.06, 1e-6])), 9.81 * torch.tensor([0.342, 0.0, -0.94])
+    exact, speed, step = torch.zeros(2), torch.tensor([0.0, 0.8]), 1e-5
+    for _ in range(20_000):  # explicit midpoint
+        middle = speed + 0.5 * step * (gravity[:2] + 0.6 * gravity[2] * speed / speed.norm())
+        exact = exact + step * middle
+        speed = speed + step * (gravity[:2] + 0.6 * gravity[2] * middle / middle.norm())
+    errors = []
+    for dt in (0.02, 0.01, 0.005):
+        scene = body(dt=dt, corners=flat, mu=0.6, gravity=gravity, inertia=0.001)
+        start = torch.tensor([0.0, 0.0, 1e-6, 1.0, 0.0, 0.0, 0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 0.0])
+        path = scene.rollout(start, Drive(torch.zeros(round(0.2 / dt), 6)))
+        errors.append(float((path.positions[-1, :2] - exact).norm()))
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
+
+
 def test_a_rotation_about_the_vertical_rotates_the_motion():
     angle = 0.7
     about = torch.tensor([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)])

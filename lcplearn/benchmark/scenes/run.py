@@ -21,15 +21,18 @@ from lcplearn.benchmark.scenes.cases import (
 )
 from lcplearn.benchmark.scenes.contact_cases import CURVED, DT, MU, body_rows, body_scenes, curve_rows
 from lcplearn.benchmark.scenes.figures import cone_bars, curve_lines, error_time, time_bars
+from lcplearn.benchmark.scenes.fused import WHAT, fused_rows
 
 KEY = ("part", "scene", "dt", "batch")
 COLUMNS = (
     "formulation", "rows", "full_rows", "velocity_difference", "step_us", "step_low_us", "step_high_us",
-    "full_over_this", "steps", "seconds", "position_error", "end_error", "energy_error", "penetration", "solved",
+    "full_over_this", "torch_us", "steps", "seconds", "position_error", "end_error", "energy_error", "penetration",
+    "solved",
 )  # fmt: skip
 STEP_SIZES = tuple(10.0 ** (-k / 3) for k in range(3, 13))  # [s] 0.1 to 1e-4
 BATCHES = (1, 100, 10_000)
 BODY_BATCHES = (1, 64, 1000)
+FUSED_BATCHES = (1, 64)
 
 
 def run(options: Options) -> None:
@@ -43,6 +46,8 @@ def run(options: Options) -> None:
             rows = [*motion_rows(str(scene), float(dt), 3 if options.quick else 7).values()]
         elif part == "body":
             rows = body_rows(str(scene), int(batch), 3 if options.quick else 7, options.seed)
+        elif part == "fused":
+            rows = fused_rows(str(scene), int(batch), 3 if options.quick else 15, options.seed)
         else:
             rows = curve_rows(float(dt), 1 if options.quick else 5)
         study.add(key, *rows)
@@ -56,6 +61,8 @@ def plan(quick: bool) -> Iterable[tuple[Any, ...]]:
         yield from (("motion", scene, dt, 1) for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1])
     for scene in body_scenes():
         yield from (("body", scene, DT, batch) for batch in BODY_BATCHES[: 2 if quick else 3])
+    for what in WHAT[:1] if quick else WHAT:
+        yield from (("fused", what, DT, batch) for batch in FUSED_BATCHES)
     yield from (("curve", CURVED.name, dt, 1) for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1])
 
 
@@ -63,6 +70,8 @@ def expected_seconds(part: Any, scene: Any, dt: Any, batch: Any) -> float:
     """Rough cost of a key of the full run."""
     if part == "body":
         return 2.0 + 5e-3 * float(batch)
+    if part == "fused":
+        return 20.0
     if part == "curve":
         return 24 * 1e-4 * CURVED.duration / float(dt)
     each = 0.3 + 1e-4 * batch if part == "step" else 8 * 8e-5 * DURATION / dt
@@ -207,6 +216,17 @@ def _say_bodies(study: Study) -> None:
         table=Table(heads, [tuple(row[column] for column in columns) for row in bodies]),
         figure=cone_bars(bodies, MU * 9.81 * DT),
     )
+    fused = [row for row in study.rows if row["part"] == "fused"]
+    study.say(
+        "What is a compiled contact step worth?",
+        "A box with eight corners, its contact step alone, its whole step, and 20 steps: CPU time of a step of one "
+        "box, compiled and assembled in torch, and the largest relative difference of velocities, or of gradients.",
+        table=Table(
+            ("what", "batch", "", "compiled [us]", "torch [us]", "torch / compiled", "difference"),
+            [(r["scene"], r["batch"], r["formulation"], r["step_us"], r["torch_us"], r["full_over_this"],
+              r["velocity_difference"]) for r in fused],
+        ),
+    )  # fmt: skip
     curves = [row for row in study.rows if row["part"] == "curve"]
     study.say(
         "Which step size and friction for a slide that curves?",
