@@ -26,8 +26,7 @@ def _drake(settings: drake.Settings, scene: StickScene, dt: float, mu: float) ->
 ENGINES: tuple[Engine, ...] = (
     Engine("lcplearn", "", "rows as each scene needs", partial(ours.simulation, ours.minimal),
            (1e-2, 4e-3, 1e-3)),
-    Engine("lcplearn body", "", "a box with eight corners in space", partial(ours.simulation, ours.body),
-           (1e-2, 2e-3)),
+    Engine("lcplearn body", "", "a box with eight corners in space", partial(ours.simulation, ours.body)),
     Engine("MuJoCo", "mujoco", "defaults", partial(_mujoco, mujoco.Settings())),
     Engine("MuJoCo elliptic", "mujoco", "cone=elliptic", partial(_mujoco, mujoco.Settings("elliptic"))),
     Engine("MuJoCo noslip", "mujoco", "cone=elliptic, impratio=100, noslip_iterations=10",

@@ -25,8 +25,8 @@ from lcplearn.scenes import BouncingBlock, SlidingBlock
 from lcplearn.scenes.contact import Contacts, contact_step
 from lcplearn.scenes.planar_block import PlanarBlock
 from lcplearn.scenes.planar_body import PlanarBody, PlanarStack, rectangle
-from lcplearn.scenes.scene import Drive, Step
-from lcplearn.scenes.space import rotation_matrix
+from lcplearn.scenes.scene import Drive, Step, rollout
+from lcplearn.scenes.space import Space, rotation_matrix
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
 GRAVITY = 9.81  # [m/s^2]
@@ -217,6 +217,17 @@ class FixedContacts:
     mu: Any
     dt: float
 
+    @property
+    def space(self) -> Space:
+        """A position and a velocity for each mass."""
+        names = range(len(self.mass))
+        return Space(tuple(f"x{i}_m" for i in names), tuple(f"x{i}_velocity_m_s" for i in names))
+
+    @property
+    def contacts(self) -> int:
+        """How many may touch."""
+        return len(self.normal)
+
     def advance(self, state: Tensor, drive: Drive) -> Step:
         """Advance a state by one step; gaps are linear in the positions."""
         position, velocity = state.split(len(self.mass), dim=-1)
@@ -229,40 +240,36 @@ class FixedContacts:
 
 
 class OurSimulation:
-    """A scene of ours, stepped from Python."""
+    """A scene of ours by its rollout: one compiled call for a body in space, else step after step from Python."""
 
     def __init__(self, scene: StickScene, dt: float, mu: float, setup: Setup) -> None:
-        self.scene, self.dt, self.mu, self.setup = scene, dt, mu, setup
-        self.stepped = setup.make(mu)
+        self.dt, self.mu, self.setup = dt, mu, setup
+        self.scene, self.stepped = scene, setup.make(mu)
+        self.drives: dict[int, Drive] = {}
 
-    def _drive(self, step: int) -> Drive:
-        return Drive(self.setup.force + self.scene.push((step + 0.5) * self.dt) * self.setup.push)
+    def _states(self, stepped: Any, steps: int, start: Tensor) -> Tensor:
+        if steps not in self.drives:
+            pushes = [[self.scene.push((step + 0.5) * self.dt)] for step in range(steps)]
+            self.drives[steps] = Drive(self.setup.force + torch.tensor(pushes, dtype=torch.float64) * self.setup.push)
+        path = rollout(stepped, start, self.drives[steps])
+        return torch.cat((path.positions, path.velocities), dim=-1)
 
     @torch.no_grad()
     def path(self, steps: int) -> Path:
-        states = [self.setup.start]
-        for step in range(steps):
-            states.append(self.stepped.advance(states[-1], self._drive(step)).state)
-        return Path(*(x.numpy() for x in self.setup.read(torch.stack(states))))
-
-    def run(self, steps: int) -> None:
-        self._run(steps, self.setup.start)
-
-    def run_many(self, steps: int, batch: int) -> bool:
-        self._run(steps, self.setup.start.expand(batch, -1))
-        return True
+        return Path(*(x.numpy() for x in self.setup.read(self._states(self.stepped, steps, self.setup.start))))
 
     @torch.no_grad()
-    def _run(self, steps: int, state: Tensor) -> None:
-        for step in range(steps):
-            state = self.stepped.advance(state, self._drive(step)).state
+    def run(self, steps: int) -> None:
+        self._states(self.stepped, steps, self.setup.start)
+
+    @torch.no_grad()
+    def run_many(self, steps: int, batch: int) -> bool:
+        self._states(self.stepped, steps, self.setup.start.expand(batch, -1))
+        return True
 
     def end_slope(self, steps: int) -> np.ndarray | None:
         mu = torch.tensor(self.mu, dtype=torch.float64, requires_grad=True)
-        scene, state = self.setup.make(mu), self.setup.start
-        for step in range(steps):
-            state = scene.advance(state, self._drive(step)).state
-        position = self.setup.read(state[None]).position[0]
+        position = self.setup.read(self._states(self.setup.make(mu), steps, self.setup.start)[-1:]).position[0]
         if not position.requires_grad:
             return np.zeros(3)
         slopes = (torch.autograd.grad(x, mu, retain_graph=True, allow_unused=True)[0] for x in position)
