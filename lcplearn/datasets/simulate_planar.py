@@ -1,7 +1,7 @@
 """Simulated recordings of bodies in the plane."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -28,6 +28,7 @@ def simulate_planar_block(
     gravity: float = 9.81,
     noise: float = 0.0,
     switch_probability: float = 0.1,
+    friction: Literal["physical"] | None = None,
 ) -> Task:
     """Record a block pushed about on a table in two directions.
 
@@ -48,11 +49,14 @@ def simulate_planar_block(
         gravity: [m/s^2].
         noise: Standard deviation of measured velocities [m/s].
         switch_probability: Probability that the force changes its level at a step.
+        friction: "physical" adds the friction force of each step [N], free of noise, for models that need it.
 
     Raises:
         ValueError: An argument is out of range.
     """
     check(NOT_NEGATIVE, noise=noise)
+    if friction not in (None, "physical"):
+        raise ValueError(f"friction: expected 'physical' or None, got {friction!r}")
     block = PlanarBlock(mass=mass, mu=mu, dt=dt, gravity=gravity)
     sizes = {"train": (trajectories, length), "validation": (max(trajectories // 2, 1), length)}
     sizes |= {"test": (test_trajectories, length), "test_long": (long_trajectories, long_length)}

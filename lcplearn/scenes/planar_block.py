@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check_numbers
+from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.contact import Contacts, contact_step
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
@@ -31,6 +32,21 @@ def slide_in_plane(p: Float[Tensor, "*#batch 2"], c: Float[Tensor, "*#batch"] | 
     slides = speed > c
     factor = 1.0 - c / torch.where(slides, speed, 1.0)
     return torch.where(slides.unsqueeze(-1), factor.unsqueeze(-1) * p, 0.0)
+
+
+def facet_normals(m: int, like: Tensor) -> Float[Tensor, "2 m"]:
+    """Directions of the m facets of a regular polygon around the unit disc."""
+    angles = torch.arange(m, dtype=like.dtype, device=like.device) * (2.0 * math.pi / m)
+    return torch.stack((angles.cos(), angles.sin()))
+
+
+def slide_on_facets(
+    p: Float[Tensor, "*#batch 2"], c: Float[Tensor, "*#batch"], m: int
+) -> tuple[Float[Tensor, "..."], LCPSolution]:
+    """As `slide_in_plane`, with a polygon of m facets in place of the disc; and the solution of its LCP."""
+    N = facet_normals(m, p)
+    solution = solve_lcp(N.mT @ N, c.unsqueeze(-1) - p @ N)
+    return matvec(N, solution.z), solution
 
 
 @dataclass(frozen=True)
@@ -111,12 +127,11 @@ class PlanarBlock:
         return as_tensor(self.mu, like) * as_tensor(self.gravity, like) * self.dt
 
     def _by_polygon(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        if self.form == "facets":
+            velocity, solution = slide_on_facets(p, self._limit(p), self.m)
+            return velocity, solution.solved
         angles = torch.arange(self.m, dtype=p.dtype, device=p.device) * (2.0 * math.pi / self.m)
         limit = self._limit(p).unsqueeze(-1)
-        if self.form == "facets":
-            N = torch.stack((angles.cos(), angles.sin()))
-            solution = solve_lcp(N.mT @ N, limit - p @ N)
-            return matvec(N, solution.z), solution.solved
         # Its vertices: the facets' polygon has them at half the angle, 1 / cos(pi / m) further out.
         corners = torch.stack(((angles + math.pi / self.m).cos(), (angles + math.pi / self.m).sin()))
         M = torch.nn.functional.pad(corners.mT @ corners, (0, 1, 0, 1))

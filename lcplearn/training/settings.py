@@ -127,11 +127,16 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
 def _check_friction(settings: Mapping[str, Any]) -> None:
     """Models of known friction learn from labels that only simulations have."""
     model = str(settings["model"].get("_target_")).rpartition(".")[2]
-    if model not in ("Direct", "Slack"):
+    if model not in ("Direct", "PlanarDirect", "Slack"):
         return
-    accepted = signature(str(settings["data"].get("_target_")))
+    data = str(settings["data"].get("_target_"))
+    if model == "Slack" and "planar" in data:
+        raise SettingsError(
+            "model=slack is for a block on a line: in two directions the slacks don't determine the velocity."
+        )
+    accepted = signature(data)
     if accepted is not None and "friction" not in accepted:
-        raise SettingsError(f"model={model.lower()} needs friction labels, which only data=sliding_block has.")
+        raise SettingsError(f"model={model.lower()} needs friction labels, which only simulated blocks have.")
     if not settings["data"].get("friction"):
         kinds = "slack" if model == "Slack" else "physical or data.friction=lcp"
         raise SettingsError(f"model={model.lower()} needs friction labels: set data.friction={kinds}.")

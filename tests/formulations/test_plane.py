@@ -6,7 +6,7 @@ import torch
 from lcplearn.datasets.simulate_planar import simulate_planar_block, simulate_planar_body
 from lcplearn.formulations.formulation import build
 from lcplearn.formulations.identified import Identified
-from lcplearn.formulations.plane import PlanarFriction
+from lcplearn.formulations.plane import PlanarDirect, PlanarFriction, PlanarTraditional
 from lcplearn.scenes.scene import Drive
 from lcplearn.scenes.space import PLANE
 
@@ -34,6 +34,40 @@ def test_sticks_survive_errors_of_what_is_learned():
     sticks = (task.test.states[:, 1:, 2:] == 0).all(-1)
     assert sticks.any()
     assert (predicted[sticks] == 0).all(-1).double().mean() > 0.99
+
+
+def test_direct_and_traditional_hold_the_truth_where_friction_or_the_matrices_are_known():
+    task = simulate_planar_block(
+        trajectories=4, test_trajectories=4, long_trajectories=1, long_length=5, friction="physical"
+    )
+    direct = build(PlanarDirect, task)
+    with torch.no_grad():
+        direct.weight[:, 2:] /= 1.5
+        direct.G.copy_(torch.eye(2) / 1.5)
+    before, after = task.test.states[:, :-1], task.test.states[:, 1:]
+    torch.testing.assert_close(direct.advance(before, task.test.drive).state, after, rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match="friction: expected measured friction"):
+        direct.advance(before, Drive(task.test.drive.force))
+    unit = simulate_planar_block(mass=1.0, test_trajectories=8, long_trajectories=1, long_length=5)
+    errors = []
+    for m in (8, 32):
+        traditional = build(PlanarTraditional, unit, m=m, initial_mu=0.4, initial_noise=0.0)
+        step = traditional.advance(unit.test.states[:, :-1], unit.test.drive)
+        assert step.solved.all()
+        errors.append(float((step.state - unit.test.states[:, 1:]).square().mean().sqrt()))
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_facets_approach_the_disc_and_tell_their_friction_coefficient():
+    task = simulate_planar_block(mass=1.0, test_trajectories=8, long_trajectories=1, long_length=5)
+    errors = []
+    for facets in (8, 32):
+        model = build(PlanarFriction, task, initial_limit=0.4 * 9.81, facets=facets)
+        step = model.advance(task.test.states[:, :-1], Drive(task.test.drive.force))
+        assert step.solved.all()
+        errors.append(float((step.state - task.test.states[:, 1:]).square().mean().sqrt()))
+        assert model.physical_parameters() == pytest.approx({"mu": 0.4, "mass": 1.0})
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_a_tossed_rectangle_is_reproduced_by_its_true_numbers_and_gives_them_gradients():

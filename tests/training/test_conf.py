@@ -90,7 +90,8 @@ def test_every_model_of_pushes_passes_the_check_and_is_built(choice: str) -> Non
 def test_every_formulation_has_a_configuration() -> None:
     others = [name for name in names("model") if not name.startswith("push_")]
     targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in others}
-    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified", "CubeCorners", "PlanarFriction"}
+    planar = {"PlanarFriction", "PlanarDirect", "PlanarTraditional"}
+    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified", "CubeCorners"} | planar
 
 
 def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
@@ -140,7 +141,8 @@ def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
         ("model=push_ridge", "a model of pushes needs data=pushes"),
         ("experiment=pushes_mlp loss.prediction=2", "loss can't be chosen with data=pushes"),
         ("experiment=pushes_mlp seed=1 ckpt_path=README.md", "ckpt_path can't be set with data=pushes"),
-        ("data=cube_slides model=slack", "model=slack needs friction labels, which only data=sliding_block has."),
+        ("data=cube_slides model=slack", "model=slack needs friction labels, which only simulated blocks have."),
+        ("data=planar_block model=slack", "model=slack is for a block on a line: in two directions the slacks don't"),
     ],
 )
 def test_a_mistake_gets_one_sentence_with_a_suggestion(overrides: str, message: str) -> None:
