@@ -66,6 +66,8 @@ def simulate_planar_block(
         start = split.normal(2)
         start[: split.count // 2] = 0.0
         path = rollout(block, torch.cat((torch.zeros_like(start), start), dim=-1), drive)
+        if friction:
+            drive = Drive(drive.force, mass * path.velocities.diff(dim=1) / dt - drive.force)
         recordings[split.name] = split.recordings(path.states, drive, noise, 2)
     given, truth = {"gravity": gravity}, {"mu": mu, "mass": mass}
     return Task("planar_block", TABLE, dt, **recordings, given=given, truth=truth, scene=block)
