@@ -28,7 +28,6 @@ MODELS: Mapping[str, Callable[..., PushModel]] = {
     "ridge": Ridge,
     "MLP": PushMLP,
 }
-FEWEST = 50  # below it there is no rim and no process to learn
 WORTH_SEEING = 20  # a push that turns the object
 STEP = 1e-5  # of differences; logarithms, centimetres and radii
 # What the plant differs by: logarithm of mu_c, height [cm], rim.
@@ -69,8 +68,7 @@ def _plan(quick: bool) -> Iterator[tuple[str, str | int, str, int]]:
     yield from (("time", batch, "", 0) for batch in (1, 400))
     yield "fit", 3, "", 0
     for number in NUMBERS[:1] if quick else NUMBERS:
-        names = [name for name in MODELS if name != "supports + process" or number >= FEWEST]
-        yield from (("few", number, name, k) for name in names for k in range(2 if quick or number > FEWEST else 5))
+        yield from (("few", number, name, k) for name in MODELS for k in range(2 if quick or number > 50 else 5))
     for plant in list(PLANTS)[: 1 if quick else None]:
         yield from (("plan", plant, planner, 0) for planner in PLANNERS)
 
@@ -129,9 +127,8 @@ def seconds_to_fit(data: PushData) -> float:
 def from_few(data: PushData, number: int, method: str, seed: int) -> float:
     """Mean deviation [mm] on all others, learned from some pushes."""
     order = torch.randperm(len(data.configuration), generator=torch.Generator().manual_seed(seed))
-    options = {"rim": False} if method == "supports" and number < FEWEST else {}
     torch.manual_seed(seed)  # of the network
-    model = fitted(MODELS[method](**thing(data), **options), data.take(order[:number]))
+    model = fitted(MODELS[method](**thing(data)), data.take(order[:number]))
     others = data.take(order[number:])
     missing = set(others.pushes.surface) - set(model.arguments.get("surfaces", others.pushes.surface))
     assert not missing, f"no push on {missing}"
@@ -172,13 +169,11 @@ def _say(study: Study) -> None:
         table=Table(("numbers", "s"), [(row["case"], row["seconds"]) for row in rows("fit")]),
     )
     groups: dict[tuple[Any, Any], list[float]] = {}
-    for row in rows("few"):
+    for row in sorted(rows("few"), key=lambda row: (list(MODELS).index(row["method"]), row["case"])):
         groups.setdefault((row["method"], row["case"]), []).append(row["deviation"])
     study.say(
         "How many pushes does a model need?",
-        "Mean deviation [mm] on all other pushes: mean, least and largest of the draws. "
-        f"From fewer than {FEWEST} pushes "
-        "the supports learn mu_c and the height alone.",
+        "Mean deviation [mm] on all other pushes: mean, least and largest of the draws.",
         figure=_draw_few(groups),
         table=Table(
             ("model", "pushes", "mean", "least", "largest"),
