@@ -76,7 +76,7 @@ def filmstrip(toss: Toss, *, frames: int = 6) -> "Figure":
     limits = _limits(toss)
     for ax, row in zip(axes, chosen, strict=True):
         _frame(ax, toss, row, limits)
-        ax.set_title(f"{row * toss.dt:.2f} s", fontsize=9, y=0.9)
+        ax.set_title(f"{row * toss.dt:.2f} s", fontsize=9, y=1.0)
     figure.supxlabel("a real toss (grey), and predicted from its first row alone (red)", fontsize=10)
     return figure
 

@@ -59,7 +59,8 @@ class MujocoCube:
     def rollout(self, tosses: Tosses, start: Float[Tensor, "B 13"], steps: int) -> Float[Tensor, "B rows 13"]:
         """States over a number of steps, each of four substeps.
 
-        A recorded velocity is the mean over the step before: it is brought to the last substep, and back afterwards.
+        A recorded velocity is the mean over the step before. At the start it is brought to the last substep; afterwards
+        it is the difference of positions.
         """
         import mujoco
         from mujoco.rollout import rollout
@@ -70,8 +71,10 @@ class MujocoCube:
         time = torch.zeros(len(start), 1, dtype=torch.float64)
         first = torch.cat((time, start + fall), dim=-1).numpy()
         states, _ = rollout(model, mujoco.MjData(model), first, nstep=steps * SUBSTEPS)
-        path = torch.from_numpy(np.ascontiguousarray(states[:, SUBSTEPS - 1 :: SUBSTEPS, 1:])) - fall
-        return torch.cat((start.unsqueeze(1), path), dim=1)
+        path = torch.from_numpy(np.ascontiguousarray(states[:, SUBSTEPS - 1 :: SUBSTEPS, 1:]))
+        path = torch.cat((start.unsqueeze(1), path), dim=1)
+        path[:, 1:, 7:10] = (path[:, 1:, :3] - path[:, :-1, :3]) / tosses.dt
+        return path
 
 
 def tune(tosses: Tosses, chosen: list[int], start: MujocoCube, *, evaluations: int = 300) -> MujocoCube:
