@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lcplearn.lcp.methods import pivoting_kernel
-from lcplearn.lcp.torch_internals import traced, transformed
+from lcplearn.lcp.torch_internals import forward_mode, traced, transformed
 from lcplearn.scenes.contact_solve import solve
 from lcplearn.scenes.friction_lcp import Problem
 from lcplearn.scenes.numbers import common_batch, one_batch
@@ -152,8 +152,8 @@ def contact_step(
 
 
 def compiled_contacts(device: torch.device) -> ModuleType | None:
-    """`contact_kernel.steps`, imported on first use; None off the CPU, without numba and where a tracer looks on."""
-    if device.type != "cpu" or traced() or transformed() or pivoting_kernel() is None:
+    """`contact_kernel.steps`, imported on first use; None off the CPU, without numba, traced or in forward mode."""
+    if device.type != "cpu" or traced() or transformed() or forward_mode() or pivoting_kernel() is None:
         return None
     from lcplearn.scenes.contact_kernel import steps
 
@@ -166,6 +166,8 @@ def _flatten(contacts: Contacts, free: Tensor, mass: Tensor, dt: float) -> tuple
     shapes = (x.shape[:-k] for x, k in ((gap, 1), (normal, 2), (tangents, 3), (mu, 1), (free, 1), (mass, 1)))
     batch = common_batch(*shapes, bounce.shape[:-1], compliance.shape[:-1])
     count, nv, directions = normal.shape[-2], normal.shape[-1], tangents.shape[-2]
+    if directions > 2:
+        raise ValueError(f"tangents: expected 0, 1 or 2 directions a contact, got {directions}")
 
     return (
         Problem(

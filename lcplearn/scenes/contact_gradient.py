@@ -4,7 +4,7 @@ With loads lambda and friction forces f, together y, of the contacts that are lo
 
     n v - target + compliance lambda = 0
     T v = 0                               where a contact sticks
-    f + mu lambda d = 0,  d = Tv / |Tv|   where it slips
+    f + mu lambda d = 0,  d = Tv / |Tv|   where it slips; and where mu = 0, with d = 0 if nothing slips
 
 are r(y, parameters) = 0. Its derivative K = dr/dy gives dy = -K^-1 dr: here as one Newton step y - K^-1 r with K
 constant, whose value is y and whose gradient is that. Where contacts are redundant K is singular, and the smallest
@@ -56,12 +56,16 @@ def _newton_step(part: Problem, found: Answer) -> tuple[Tensor, Tensor, Tensor]:
     slip = speed[..., 1:]
     with torch.no_grad():
         size = torch.linalg.vector_norm(slip, dim=-1)
-        sticks = found.sticks | (size <= CREEPS * part.speed_scale())
+        limit = (part.mu * y[..., 0]).unsqueeze(-1)
+        still = found.sticks | (size <= CREEPS * part.speed_scale())
+        sticks = still & (limit[..., 0] > 0.0)  # what has no friction is held by nothing
         slips = ~sticks.unsqueeze(-1)
         # in units of speed, like the other rows
         unit = (part.normal.square() / part.mass.unsqueeze(-2)).sum(-1, keepdim=True)
-    direction = slip / torch.linalg.vector_norm(torch.where(slips, slip, 1.0), dim=-1, keepdim=True).clamp_min(1e-300)
-    limit = (part.mu * y[..., 0].detach()).unsqueeze(-1)
+    moves = ~still.unsqueeze(-1)
+    direction = slip / torch.linalg.vector_norm(torch.where(moves, slip, 1.0), dim=-1, keepdim=True).clamp_min(1e-300)
+    direction = torch.where(moves, direction, 0.0)
+    limit = part.mu.unsqueeze(-1) * y[..., :1].detach()
     law = torch.where(slips, unit * (y[..., 1:].detach() + limit * direction), slip)
     opening = speed[..., 0] - part.target + part.compliance * y[..., 0]
     r = torch.cat((opening.unsqueeze(-1), law), dim=-1).flatten(1)
@@ -72,7 +76,7 @@ def _newton_step(part: Problem, found: Answer) -> tuple[Tensor, Tensor, Tensor]:
         if T:
             d = direction
             turning = torch.eye(T, dtype=A.dtype, device=A.device) - d.unsqueeze(-1) * d.unsqueeze(-2)
-            speed_floor = torch.where(sticks, 1.0, size).unsqueeze(-1)
+            speed_floor = torch.where(still, 1.0, size).unsqueeze(-1)
             turning = (unit * limit / speed_floor).unsqueeze(-1) * turning
             moving = torch.einsum("bcut,bctds->bcuds", turning, A[:, :, 1:])
             own = torch.einsum("bct,cd->bctd", unit * part.mu.unsqueeze(-1) * d, identity)

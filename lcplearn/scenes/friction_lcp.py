@@ -195,14 +195,16 @@ def cone_lcp(problem: Problem, guide: Answer | None) -> Answer:
     if problem.directions == 2:
         forces.append(-matvec(across[..., :-1], torch.cat(forces, dim=-1)) - across[..., -1])
     velocity = problem.free + matvec(response.mT, torch.cat(forces, dim=-1))
+    sticks = slip_along == 0.0
     if problem.directions == 2:
         # exact where a weight makes it small; what has no load slips as it will
         loaded = weight > 0.0
         across_speed = matvec(along[..., 1, :], velocity)
         slips.append(torch.where(loaded, -forces[2] / torch.where(loaded, weight, 1.0), across_speed))
+        sticks = sticks & (loaded | (across_speed == 0.0))
     friction = (torch.stack(forces[1:], dim=-1).unsqueeze(-2) @ axes).squeeze(-2)
     slip = (torch.stack(slips, dim=-1).unsqueeze(-2) @ axes).squeeze(-2)
-    return Answer(velocity, normal, friction, slip, slip_along == 0.0, solution.solved, solution.solved)
+    return Answer(velocity, normal, friction, slip, sticks, solution.solved, solution.solved)
 
 
 def law_violation(problem: Problem, answer: Answer) -> Tensor:

@@ -109,8 +109,14 @@ class PushedObject:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
 
     def rollout(self, push: Push, grip: Grip) -> PushPath:
-        """Push, in `steps` equal steps of the finger from the first touch to the end of its path."""
-        wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in (*push, *grip))
+        """Push, in `steps` equal steps of the finger from the first touch to the end of its path.
+
+        Raises:
+            ValueError: A tensor has another shape than `Push` and `Grip` say.
+        """
+        _check_shapes(push, grip)
+        inputs = (*push, *grip, self.vertices, self.com)
+        wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
         if wanted or self.law != "cone" or compiled_pushing(push.pose) is None:
             return self._rollout_stepwise(push, grip)
         path = self._rollout_compiled(push, grip)
@@ -247,6 +253,16 @@ class PushedObject:
 
     def _pose(self, centre: Tensor, angle: Tensor) -> Tensor:
         return torch.cat((centre * self.radius - rotate(angle, self.com), angle[..., None]), -1)
+
+
+def _check_shapes(push: Push, grip: Grip) -> None:
+    """Compiled code reads as many numbers as it expects: nothing is broadcast."""
+    b, k = len(push.pose), grip.points.shape[-2]
+    shapes = {"pose": (b, 3), "start": (b, 2), "end": (b, 2), "points": (b, k, 2), "loads": (b, k), "levers": (b, k, 2)}
+    shapes |= {"mu": (b,), "finger_mu": (b,), "height": (b,), "shift": (b, 2), "wrench": (b, 3)}
+    for name, value in (push._asdict() | grip._asdict()).items():
+        if value is not None and value.shape != shapes[name]:
+            raise ValueError(f"{name}: expected shape {list(shapes[name])}, got {list(value.shape)}")
 
 
 def plane_fit(

@@ -136,7 +136,8 @@ class _Settle(torch.autograd.Function):
         out = (np.empty((batch, supports, 2)), np.empty((batch, 3)), np.empty((batch, 2)))
         flags = np.empty((batch, 3), np.int64)
         _settle(*arrays, creep, iterations, state, out, flags)
-        ctx.kept, ctx.creep = (arrays, state, flags), creep
+        ctx.save_for_backward(*inputs)
+        ctx.kept, ctx.creep = (state, flags), creep
         new, twist, force, told = (torch.from_numpy(x) for x in (*out, flags))
         ctx.mark_non_differentiable(new, told)
         return twist, force, new, told
@@ -144,7 +145,7 @@ class _Settle(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, twist_grad: Tensor, force_grad: Tensor, *_: Any) -> Any:
-        arrays, state, flags = ctx.kept
+        arrays, (state, flags) = tuple(as_array(x) for x in ctx.saved_tensors), ctx.kept
         grads = tuple(np.zeros_like(x) for x in arrays)
         _adjoint(*arrays, ctx.creep, state, flags, (as_array(twist_grad), as_array(force_grad)), grads)
         return None, None, None, *(torch.from_numpy(x) for x in grads)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import lcplearn
 from lcplearn.lcp.methods import pivoting_kernel
-from lcplearn.lcp.torch_internals import traced, transformed
+from lcplearn.lcp.torch_internals import forward_mode, traced, transformed
 from lcplearn.scenes.pushing_lcp import Bearing, Touch, aligned_lcp
 from lcplearn.scenes.scene import Mode
 
@@ -77,7 +77,9 @@ def settle_by_lcp(bearing: Bearing, touch: Touch, slip: Tensor, *, creep: float,
 
 def compiled_pushing(x: Tensor) -> ModuleType | None:
     """`pushing_node`, imported on first use; None where numba is not there or may not look at the numbers."""
-    if x.device.type != "cpu" or x.dtype != torch.float64 or traced() or transformed() or pivoting_kernel() is None:
+    if x.device.type != "cpu" or x.dtype != torch.float64 or traced() or transformed() or forward_mode():
+        return None
+    if pivoting_kernel() is None:
         return None
     from lcplearn.scenes import pushing_node
 

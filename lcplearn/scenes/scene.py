@@ -138,10 +138,10 @@ def rollout(scene: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], drive: Dri
         The trajectory, with the start as its first instant.
 
     Raises:
-        ValueError: drive.force has fewer than two dimensions or no step, or state has another number of columns.
+        ValueError: drive.force has fewer than two dimensions or no step, or force or state another number of columns.
     """
     force, space = drive.force, scene.space
-    if force.ndim < 2 or force.shape[-2] == 0:
+    if force.ndim < 2 or force.shape[-2] == 0 or force.shape[-1] != space.nv:
         raise ValueError(f"forces: expected shape [*batch, T, {space.nv}] with T >= 1, got {list(force.shape)}")
     space.split(state)
     fused = getattr(scene, "fused_rollout", None)

@@ -240,17 +240,18 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, options: Options, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rolled = roll(given, options, keep=True)
-        ctx.options, ctx.rolled = options, rolled
-        ctx.save_for_backward(*given)
-        states, modes, solved = (torch.from_numpy(x) for x in rolled[:3])
+        rolled = tuple(torch.from_numpy(x) for x in roll(given, options, keep=True))
+        ctx.options = options
+        ctx.save_for_backward(*given, *rolled)
+        states, modes, solved = rolled[:3]
         ctx.mark_non_differentiable(modes, solved)
         return states, modes, solved
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        return (None, *pull_back(ctx.saved_tensors, ctx.options, ctx.rolled, gradient))
+        given, rolled = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
+        return (None, *pull_back(given, ctx.options, Rolled(*(x.detach().numpy() for x in rolled)), gradient))
 
 
 def pull_back(given: Sequence[Tensor], options: Options, rolled: Rolled, gradient: Tensor) -> list[Tensor]:

@@ -123,6 +123,8 @@ class SpatialBody:
         if state.dtype is not torch.float64 or force.dtype is not torch.float64:
             return None
         POSE.split(state)
+        if force.shape[-1] != POSE.nv:
+            raise ValueError(f"force: expected {POSE.nv} columns, force and torque, got {list(force.shape)}")
         mass, down = self._mass(state), self._gravity(state)
         numbers = (self.radius, self.restitution, self.mu, self.mu if self.mu_impact is None else self.mu_impact)
         given = stack_numbers(*numbers, self.ground, self.compliance / self.mass, like=state)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_data import real_data
@@ -216,6 +217,37 @@ def test_all_published_friction_problems_obey_the_law_of_the_cone():
         assert step.settled, name
         scale = max(float(free.abs().amax()), float(step.normal_impulse.amax()), 1.0)
         assert violation(contacts, free, mass, step) < 1e-10 * scale, name
+
+
+def test_forward_mode_gives_what_reverse_mode_gives():
+    contacts, free, mass = boxes(40, 1, compliance=1e-3)
+    draw = torch.Generator().manual_seed(3)
+    direction, weights = (torch.randn(free.shape, generator=draw) for _ in range(2))
+    start = free.clone().requires_grad_()
+    step = contact_step(contacts, start, mass, DT)
+    backward = (torch.autograd.grad((weights * step.velocity).sum(), start)[0] * direction).sum(-1)
+    with forward_ad.dual_level():
+        velocity = contact_step(contacts, forward_ad.make_dual(free, direction), mass, DT).velocity
+        forward = (weights * forward_ad.unpack_dual(velocity).tangent).sum(-1)
+    right = step.solved & step.settled
+    torch.testing.assert_close(forward[right], backward[right], rtol=1e-6, atol=1e-6)
+
+
+def test_a_step_changed_in_place_has_no_gradient():
+    """It would be a wrong one: impulses are what the gradient is computed from."""
+    contacts, free, mass = boxes(5, 1)
+    step = contact_step(contacts, free.requires_grad_(), mass, DT)
+    with torch.no_grad():
+        step.normal_impulse.div_(DT)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        step.velocity.sum().backward()
+
+
+def test_three_friction_directions_are_refused():
+    contacts, free, mass = boxes(2, 1)
+    wrong = contacts._replace(tangents=contacts.tangents[..., [0, 1, 1], :])
+    with pytest.raises(ValueError, match="tangents: expected"):
+        contact_step(wrong, free, mass, DT)
 
 
 @pytest.mark.parametrize("compliance", [0.0, 1e-3])

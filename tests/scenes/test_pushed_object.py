@@ -264,6 +264,24 @@ def test_plane_fit_balances_the_weight_and_the_moment():
     torch.testing.assert_close(arms.mT @ levers, torch.eye(2, dtype=F).expand(5, 2, 2), atol=1e-10, rtol=0)
 
 
+@pytest.mark.parametrize("name", ["points", "loads", "levers", "mu", "finger_mu", "height"])
+def test_a_grip_for_another_number_of_pushes_is_refused(name):
+    """Compiled code would read on in memory."""
+    grip = triangle_grip(6)
+    with pytest.raises(ValueError, match=f"{name}: expected"):
+        triangle().rollout(random_pushes(6), grip._replace(**{name: getattr(grip, name)[:1]}))
+
+
+def test_a_grip_changed_in_place_has_no_gradient():
+    grip = triangle_grip(6)
+    loads = grip.loads.clone().requires_grad_()
+    path = triangle(steps=2).rollout(random_pushes(6), grip._replace(loads=loads))
+    with torch.no_grad():
+        loads[:, 0] *= 0.5
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        path.poses.sum().backward()
+
+
 @pytest.mark.parametrize("bad", [{"vertices": SQUARE.flip(0)}, {"steps": 0}, {"creep": 0.0}])
 def test_what_makes_no_sense_is_refused_by_name(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):

@@ -177,6 +177,49 @@ def test_flight_is_exact():
     torch.testing.assert_close(path.positions[:, -1, 3:], turned, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_ice_holds_nothing(compiled, monkeypatch):
+    """Neither the slip of a contact without friction nor its gradient, also where the slip is 0."""
+    if not compiled:
+        monkeypatch.setattr("lcplearn.scenes.spatial_body.compiled_contacts", lambda device: None)
+        monkeypatch.setattr("lcplearn.scenes.contact.compiled_contacts", lambda device: None)
+    ice = body(mu=0.0)
+    force = torch.zeros(6, requires_grad=True)
+    pushed = ice.advance(REST, Drive(force)).state[7:]
+    slopes = torch.stack([torch.autograd.grad(pushed[k], force, retain_graph=True)[0] for k in range(2)])
+    torch.testing.assert_close(slopes, 0.01 / 0.4 * torch.eye(2, 6), rtol=0, atol=1e-12)
+    # an edge that hits the ground slips to the side, exactly
+    tilted = torch.tensor([0.0, 0.0, 0.0, math.cos(0.15), math.sin(0.15), 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+    tilted[2] = -(CORNERS @ rotation_matrix(tilted[3:7]).mT)[:, 2].amin()
+    step = ice.advance(tilted, Drive(force))
+    assert (step.mode == Mode.SLIP).sum() == 2
+    assert not (step.mode == Mode.STICK).any()
+    slope = torch.autograd.grad(step.state[8], force)[0]
+    torch.testing.assert_close(slope, 0.01 / 0.4 * torch.eye(6)[1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 5, 7])
+def test_a_force_of_other_columns_is_refused(columns):
+    """Compiled code would read on in memory."""
+    force = torch.zeros(5, columns)
+    with pytest.raises(ValueError, match="forces: expected"):
+        body().rollout(REST, Drive(force))
+    with pytest.raises(ValueError, match="force: expected"):
+        body().advance(REST, Drive(force[0]))
+
+
+def test_a_rollout_changed_in_place_has_no_gradient():
+    """It would be a wrong one: the states are what the gradient is computed from."""
+    pytest.importorskip("numba")
+    mu = torch.tensor(0.1, requires_grad=True)
+    path = body(mu=mu).rollout(tossed(2), NOTHING.map(lambda x: x.expand(3, 6)))
+    total = path.velocities.sum()
+    with torch.no_grad():
+        path.positions[..., 2].mul_(3.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
+
+
 def test_batched_parameters_are_their_elements_one_by_one():
     state, mu = tossed(1)[0], torch.tensor([0.1, 0.3, 0.9])
     radius, inertia = torch.tensor([0.0, 0.01, 0.02]), torch.tensor([[0.001], [0.002]])

@@ -123,7 +123,7 @@ def _slope(K, T, nv, rows, y, slip, stuck, unit, mass, mu, compliance, out):
         size = 0.0
         for t in range(T):
             size += slip[c, t] ** 2
-        size = sqrt(size)
+        size = max(sqrt(size), 1e-300)
         turning = unit[c] * mu[c] * y[w * c] / size
         for j in range(w * K):
             along = 0.0
@@ -179,6 +179,8 @@ def pull_back_contacts(
                 slip[c, t] += rows[w * c + 1 + t, k] * v[k]
             size += slip[c, t] ** 2
         stuck[c] = sticks[c] or sqrt(size) <= CREEPS * sqrt(unit[c] * energy)
+        if stuck[c] and not mu[c] * y[w * c] > 0.0:  # what has no friction is held by nothing
+            stuck[c], slip[c, :] = False, 0.0
     for i in range(w * K):
         wanted[i] = y_gradient[i]
         for k in range(nv):
@@ -201,7 +203,7 @@ def pull_back_contacts(
         size, along = 0.0, 0.0
         for t in range(T):
             size += slip[c, t] ** 2
-        size = sqrt(size)
+        size = max(sqrt(size), 1e-300)
         for t in range(T):
             along += slip[c, t] * s[w * c + 1 + t] / size
         to_mu[c] = -unit[c] * y[w * c] * along

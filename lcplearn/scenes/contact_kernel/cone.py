@@ -82,6 +82,7 @@ def _read(K, axes, root, X, D, u, mu, z, w, load, friction, slip, sticks, force,
             across = c * u[2 * K + i] - e * u[K + i]
             for j in range(3 * K):
                 across += (c * D[2 * K + i, j] - e * D[K + i, j]) * impulse[j]
+            sticks[i] = sticks[i] and across == 0.0
         slip[i, 0], slip[i, 1] = c * along - e * across, e * along + c * across
 
 

@@ -126,17 +126,17 @@ def _solve(problem: Problem, rest: bool) -> Solved:
 class _Contacts(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rest: bool, *problem: Tensor) -> tuple[Tensor, ...]:
-        ctx.found = found = _solve(Problem(*problem), rest)
-        ctx.save_for_backward(*problem)
-        results = tuple(torch.from_numpy(x) for x in found)
+        results = tuple(torch.from_numpy(x) for x in _solve(Problem(*problem), rest))
+        ctx.save_for_backward(*problem, *results[1:])
         ctx.mark_non_differentiable(*results[3:])
         return results
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        given = [x.detach().contiguous().numpy() for x in ctx.saved_tensors]
+        saved = [x.detach().contiguous().numpy() for x in ctx.saved_tensors]
+        given, found = saved[: len(Problem._fields)], saved[len(Problem._fields) :]
         results = [np.zeros(x.shape) for x in given]
         wanted = [x.contiguous().numpy() for x in gradients[:3]]
-        _pull_back_all(*given[1:], *ctx.found[1:], *wanted, *results)
+        _pull_back_all(*given[1:], *found, *wanted, *results)
         return (None, *(torch.from_numpy(x) for x in results))
