@@ -5,7 +5,7 @@ from typing import Any
 import numba
 
 from lcplearn.lcp.kernel.dense import factor, members, solve
-from lcplearn.lcp.kernel.jit import EPS, SOLVED, entry, jit, jit_inline
+from lcplearn.lcp.kernel.jit import EPS, SOLVED, entry, jit, jit_merged
 from lcplearn.lcp.kernel.memory import integers, matrix, pointer, vector
 
 
@@ -27,7 +27,7 @@ def equilibrate_rows_and_columns(A, k, r, s):
             A[i, j] *= r[i] * s[j]
 
 
-@jit_inline
+@jit_merged
 def factor_transpose(M, basis, A, r, s, rows, cols, index, singular, dependent):
     """LU of M_AA' with rows r and columns s scaled, by complete pivoting if it is singular; its size and rank."""
     k, rank = members(basis, index), -1

@@ -1,7 +1,7 @@
 """Refinement of a solution at a basis, and block principal pivoting."""
 
 from lcplearn.lcp.kernel.dense import factor, factor_call, gather, gather_call, members, solve
-from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, STUCK, jit, jit_call, jit_inline
+from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, STUCK, jit, jit_call, jit_inline, jit_merged
 from lcplearn.lcp.kernel.judging import evaluate
 
 
@@ -71,7 +71,7 @@ def polish(S, p, basis, T, place, inverted, A, rows, cols, index, z, w, omega, x
     refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch)
 
 
-@jit_inline
+@jit_merged
 def block_pivoting(S, p, basis, A, rows, cols, index, wrong, z, w, omega, x, scratch, cap):
     """Flip all infeasible members of the basis at a time, from the given one; how it ended and the rounds."""
     n = p.size

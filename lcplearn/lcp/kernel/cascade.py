@@ -20,8 +20,7 @@ from lcplearn.lcp.kernel.jit import (
     TINY,
     UNSOLVED,
     entry,
-    jit,
-    jit_inline,
+    jit_merged,
 )  # fmt: skip
 from lcplearn.lcp.kernel.judging import (
     all_finite,
@@ -45,7 +44,7 @@ from lcplearn.lcp.kernel.scales import solve_by_scale
 BLOCK, LEMKE, IMPROVE, APART_BLOCK, APART_LEMKE, APART_COVER, APART_FINE, PATH, REFINED, BY_SCALE, ANEW = range(11)
 
 
-@jit
+@jit_merged
 def prepare_lemke(stage, single_precision, cover):
     """Fill the covering vector and return the smallest pivot of a try: the size of the data's precision first.
 
@@ -57,7 +56,7 @@ def prepare_lemke(stage, single_precision, cover):
     return precision * (100.0 if stage == APART_COVER else (1e-3 if stage == APART_FINE else 1.0))
 
 
-@jit_inline
+@jit_merged
 def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
     """Put a scaled solution into the caller's arrays, with exact zeros; whether these hold it to full precision.
 
@@ -74,19 +73,18 @@ def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
     return outside == 0
 
 
-@jit_inline
+@jit_merged
 def next_stage(stage, capped, budget):
     """A Lemke that is capped on the second scaling too, or a budget that is used up, leaves the interior point."""
     return PATH if capped and stage < PATH and (budget >= 0 or stage >= APART_LEMKE) else stage + 1
 
 
-@jit_inline
-def run_stage(
-    stage, left, budget, tol, single_precision, q, S, A, T, d, r, c, s, p, cover, z, w, omega, x, y, v, buffer,
-    rows, cols, index, basic, basis, column, place, basis_out
-):  # fmt: skip
+@jit_merged
+def run_stage(stage, left, budget, tol, single_precision, q, s, numbers, indices, basis_out):
     """Leave a candidate in z, w, omega and basis; how the stage ended, and its pivots or steps."""
     n = q.size
+    S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer = numbers
+    rows, cols, index, basic, basis, column, place = indices
     ended, count = STUCK, 0
     if stage == APART_BLOCK:
         for i in range(n):
@@ -113,16 +111,15 @@ def run_stage(
     return ended, count
 
 
-@jit_inline
-def solve_one(
-    M, q, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
-    rows, cols, index, basic, basis, column, place, z_out, w_out, basis_out, u_out
-):  # fmt: skip
+@jit_merged
+def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out, w_out, basis_out, u_out):
     """Run the cascade for one finite element with some q_i < 0; status, residual and iterations.
 
     What is infeasible is found out when Lemke's method first ends on a ray.
     """
     n = q.size
+    S, _, T, d, r, c, p, cover, z, w, omega, x, _, v, buffer = numbers
+    _, _, index, basic, basis, column, place = indices
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
     s = scale(M, q, r, c, S, p)
     stage = BLOCK - 1 if warm or n < 6 or n > 40 else BLOCK
@@ -138,10 +135,7 @@ def solve_one(
             if stage == APART_BLOCK:
                 rescale(M, r, c, x)
             s = scale(M, q, r, c, S, p)
-        ended, count = run_stage(
-            stage, left, budget, tol, single_precision, q, S, A, T, d, r, c, s, p, cover, z, w, omega, x, y, v, buffer,
-            rows, cols, index, basic, basis, column, place, basis_out
-        )  # fmt: skip
+        ended, count = run_stage(stage, left, budget, tol, single_precision, q, s, numbers, indices, basis_out)
         used += count
         if stage in (BLOCK, IMPROVE, APART_BLOCK):
             if ended != DONE:
@@ -164,7 +158,8 @@ def solve_one(
             if prove_infeasible(
                 M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, margin, 20 * n + 50
             ):
-                u_out[:] = v
+                for i in range(n):
+                    u_out[i] = v[i]
                 return INFEASIBLE, best, used
     return (SOLVED if accepted else MAX_ITERATIONS if capped else UNSOLVED), best, used
 
@@ -196,6 +191,8 @@ def _make(sources: str) -> Any:
         rows, cols, index = integers(scratch, f, n), integers(scratch, f + n, n), integers(scratch, f + 2 * n, n)
         basic, basis = integers(scratch, f + 3 * n, n), integers(scratch, f + 4 * n, n)
         column, place = integers(scratch, f + 5 * n, n + 1), integers(scratch, f + 6 * n + 1, 2 * n + 1)
+        numbers = S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer
+        indices = rows, cols, index, basic, basis, column, place
         # and that is all of it: at most 3 n^2 + 25 n + 13 numbers, as width <= n + 3
         unsolved = 0
         for b in range(B):
@@ -209,15 +206,15 @@ def _make(sources: str) -> Any:
                 residuals[b], statuses[b] = np.inf, NONFINITE_INPUT
                 continue
             if nonnegative(qb):
-                ws[b] = qb
+                for i in range(n):  # numba compiles a check of shapes with its message for a slice: seconds
+                    ws[b, i] = qb[i]
                 continue
             equilibrate(Mb, A, x, d)
             for i in range(n):
                 r[i] = c[i] = d[i]
             statuses[b], residuals[b], iterations[b] = solve_one(
-                Mb, qb, tol, single_precision, budget, warm, S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer,
-                rows, cols, index, basic, basis, column, place, zs[b], ws[b], bases[b], us[b]
-            )  # fmt: skip
+                Mb, qb, tol, single_precision, budget, warm, numbers, indices, zs[b], ws[b], bases[b], us[b]
+            )
             unsolved += statuses[b] == UNSOLVED
         return unsolved
 

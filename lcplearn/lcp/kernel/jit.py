@@ -32,6 +32,14 @@ def jit_inline(function: Callable[..., Any]) -> Any:
     return jit(function, forceinline=True)
 
 
+def jit_merged(function: Callable[..., Any]) -> Any:
+    """Compile a function as part of its only caller.
+
+    numba optimises a function of `jit_inline` once by itself and once more within every function above it.
+    """
+    return jit(function, inline="always")
+
+
 def jit_call(function: Any) -> Any:
     """A function of `jit_inline` as one that is called: what runs rarely need not be compiled once for each caller."""
     return jit(function.py_func)

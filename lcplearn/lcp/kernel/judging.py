@@ -4,7 +4,8 @@ from math import frexp, ldexp, sqrt
 
 import numpy as np
 
-from lcplearn.lcp.kernel.jit import EPS, EXPONENT, LARGEST, RUIZ_SWEEPS, TINY, jit, jit_call, jit_inline
+from lcplearn.lcp.kernel.jit import EPS, EXPONENT, LARGEST, RUIZ_SWEEPS, TINY, jit, jit_call, jit_inline, jit_merged
+from lcplearn.lcp.kernel.memory import integers
 
 
 @jit
@@ -85,7 +86,7 @@ def scale(M, q, r, c, S, p):
     A solution z', w' for S and p is z = s C z', w = s R^-1 w' for M and q.
     """
     n = q.size
-    row_bits, column_bits = r.view(np.int64), c.view(np.int64)
+    row_bits, column_bits = integers(r, 0, n), integers(c, 0, n)
     s = 0.0
     for i in range(n):
         row_bits[i] &= EXPONENT
@@ -125,7 +126,7 @@ def largest_share(S, z, omega, j):
     return largest
 
 
-@jit_inline
+@jit_merged
 def judge(q, S, p, d, r, c, s, z, w, omega, tol):
     """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
     n = q.size

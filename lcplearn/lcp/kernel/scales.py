@@ -77,7 +77,8 @@ def solve_small(P, small, flips, cap):
         ended, rounds = block_pivoting_call(S, p, other, size, rows, cols, tied, basic, z, w, omega, ratio, y, 20)
         count += rounds
         if ended == DONE:
-            flips[:] = other
+            for i in range(m):
+                flips[i] = other[i]
     return count
 
 
