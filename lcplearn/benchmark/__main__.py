@@ -50,7 +50,7 @@ def _run(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(options.threads)
-    if options.command in ("fuzz", "audit"):
+    if options.command in ("fuzz", "audit", "against"):
         import_module(f"lcplearn.benchmark.{options.command}.run").run(options)
         return
     from lcplearn.benchmark.harness.study import Options
@@ -80,6 +80,10 @@ def _parser() -> argparse.ArgumentParser:
     audit.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of the data")
     audit.add_argument("--output", type=Path, metavar="DIR", help="folder (default: runs/benchmark/audit)")
     _add_threads_and_seed(audit)
+    against = commands.add_parser("against", help="the kernel's speed beside that of another checkout, in turns")
+    against.add_argument("tree", type=Path, metavar="TREE", help="folder of the other checkout")
+    against.add_argument("--rounds", type=_at_least(1), default=9, metavar="N", help="of each family (default: 9)")
+    _add_threads_and_seed(against)
     report = commands.add_parser("report", help="gather studies into one self-contained HTML page")
     report.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="folders that commands wrote")
     report.add_argument("--output", type=Path, default=Path("report.html"), metavar="FILE", help="default: report.html")

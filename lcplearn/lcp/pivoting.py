@@ -21,16 +21,14 @@ Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992), chapte
 block pivoting; Mehrotra (1992) for the predictor-corrector steps; Ruiz (2001) for the scaling.
 """
 
-import os
-import sys
-from functools import cache
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from lcplearn.lcp.kernel.adjoint import adjoint_range
 from lcplearn.lcp.kernel.cascade import solve_range
+from lcplearn.lcp.kernel.jit import announce
+from lcplearn.lcp.kernel.memory import scratch_size
 from lcplearn.lcp.solution import LCPSolution
 
 
@@ -68,10 +66,10 @@ def solve_batch(
     if tol is None:
         tol = 2e-6 if single_precision else 1e-10
     budget = -1 if max_iter is None else max_iter
-    _announce_compilation()
+    announce(solve_range, "compiling the LCP kernel, once on a machine: about half a minute")
     unsolved = solve_range(
         status.numel(), n, M.dim() == 2, address(M), address(q), tol, single_precision, budget,
-        initial_basis is not None, np.empty(3 * n * n + 25 * n + 13), address(z), address(w), address(basis),
+        initial_basis is not None, np.empty(scratch_size.py_func(n)), address(z), address(w), address(basis),
         address(residual), address(status), address(iterations), address(certificate),
     )  # fmt: skip
     return LCPSolution(z, w, basis, status, residual, iterations, certificate), unsolved
@@ -130,14 +128,3 @@ def address(x: Tensor | None) -> int:
     if result == 0 and x.numel():
         raise RuntimeError("a tensor without memory (fake, traced or torch's implicit zero) reached the LCP kernel")
     return result
-
-
-@cache
-def _announce_compilation() -> None:
-    """Say once, on a terminal, that the first solve on this machine compiles."""
-    if not sys.stderr.isatty():
-        return
-    folder = getattr(solve_range.stats, "cache_path", None)
-    cached = folder is not None and os.path.isdir(folder) and any(f.startswith("cascade.") for f in os.listdir(folder))
-    if not cached:
-        sys.stderr.write("lcplearn: compiling the LCP kernel, once on a machine: a minute or more\n")

@@ -12,7 +12,7 @@ not see tiny decoupled rows, (b) accepts z = t (1, 1) with large t for M = [[1, 
 2.2e-308 count as 2.2e-308, since smaller doubles have no precision.
 
 (c) A w that is rounding noise verifies nothing: rows with |w_i| <= 8 eps omega_i count with eps d_i omega_i / max |q~|
-where that is above 1e-6. M = [[2, -2], [1, -1]], q = (-2, -2) has no solution, but with z = 1e18 (1, 1) the sum
+where that is above 1e-10. M = [[2, -2], [1, -1]], q = (-2, -2) has no solution, but with z = 1e18 (1, 1) the sum
 q + M z comes out as exactly 0 if q is added first.
 
 With smoothing tau the condition z_i w_i = tau replaces z_i w_i = 0, and its smoothed minimum replaces min: the root
@@ -117,7 +117,7 @@ def judge(
     rows = torch.minimum(share, off_path / omega.clamp_min(TINY)).abs().amax(-1)
     residual = torch.maximum(natural / q_size, rows)
     noise = torch.where(w.abs() <= 8 * EPS * omega, EPS * d * omega, 0.0).amax(-1) / q_size
-    residual = torch.where(noise > 1e-6, torch.maximum(residual, noise), residual)
+    residual = torch.where(noise > 1e-10, torch.maximum(residual, noise), residual)
     residual = torch.where(residual.isfinite(), residual, torch.inf)
     rounding = 10 * EPS * (d * absMz).amax(-1) / q_size
     return Judgement(residual, rounding.clamp(max=1e-6).clamp(min=tol))

@@ -37,7 +37,7 @@ def solve_lcp(
         q: Vectors of the dtype and device of M; batch dimensions broadcast, n may be 0.
         method: "diagonal" is the closed form z = max(0, -q / diag M) for M that the caller knows to be diagonal (one
             that is not is solved by pivoting on the CPU, and never wrongly SOLVED elsewhere);
-            "pivoting" is the CPU kernel (the first call ever compiles it: a minute or more); "interior_point" runs on
+            "pivoting" is the CPU kernel (the first call ever compiles it: half a minute); "interior_point" runs on
             any device; "auto" is pivoting on the CPU, and on a CUDA device the path of the interior point, whose few
             leftovers are solved on the CPU. For smoothing it is interior_point.
         tol: Largest residual (see `residuals.py`) that counts as solved; by default 1e-10 for float64 and 2e-6 for
@@ -89,7 +89,8 @@ def solve_lcp(
         if method not in ("auto", "pivoting"):
             raise ValueError(f"method: expected auto or pivoting for initial_basis; got {method!r}")
         initial_basis = _expand_basis(initial_basis, q)
-    options = Options(method, float(tol or default_tolerance(q.dtype)), max_iter, float(smoothing))
+    tol = default_tolerance(q.dtype) if tol is None else float(tol)
+    options = Options(method, tol, max_iter, float(smoothing))
     run = traced_solve if traced() else differentiable_solve
     solution = run(M, q, initial_basis, options)
     if throw:

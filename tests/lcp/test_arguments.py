@@ -46,6 +46,7 @@ def test_values_are_good_to_rounding_whatever_tol_calls_solved(method):
         (lambda M, q: solve_lcp(M.expand(2, 3, 3), q.expand(4, 3)), "expected batch dimensions that broadcast"),
         (lambda M, q: solve_lcp(M, q, method="lemke"), "method: expected one of auto, pivoting"),
         (lambda M, q: solve_lcp(M, q, tol=-1.0), "tol: expected a positive"),
+        (lambda M, q: solve_lcp(M, q, tol=0.0), "tol: expected a positive"),
         (lambda M, q: solve_lcp(M, q, max_iter=0), "max_iter: expected a positive integer"),
         (lambda M, q: solve_lcp(M, q, smoothing=-1.0), "smoothing: expected a finite"),
         (

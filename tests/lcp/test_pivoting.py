@@ -279,6 +279,14 @@ def test_huge_z_whose_w_is_rounding_noise_is_not_solved():
     assert solve([[2, -2], [1, -1]], [-2, -2]).status[0] != Status.SOLVED
 
 
+@pytest.mark.parametrize("single", [False, True])
+def test_the_solution_is_not_far_out_on_a_ray_of_solutions(single):
+    """z = (1, 0, 0) + t (1, 1, 0) solves for all t >= 0; rounded to float32, t = 1e9 would have lost q."""
+    result = solve([[-1, 1, 0], [1, -1, -1], [1, -1, 1]], [1, -1, 0], single_precision=single)
+    assert result.z.tolist() == [[1.0, 0.0, 0.0]]
+    assert result.w.tolist() == [[0.0, 0.0, 1.0]]
+
+
 def test_solution_beyond_the_range_of_doubles_is_not_solved():
     result = solve([[1e-300]], [-1e100])
     assert result.status[0] != Status.SOLVED

@@ -6,7 +6,7 @@ import numba
 
 from lcplearn.lcp.kernel.dense import factor, members, solve
 from lcplearn.lcp.kernel.jit import EPS, SOLVED, entry, jit, jit_merged
-from lcplearn.lcp.kernel.memory import integers, matrix, pointer, vector
+from lcplearn.lcp.kernel.memory import address, integers, matrix, pointer, vector
 
 
 @jit
@@ -50,11 +50,10 @@ def _make(sources: str) -> Any:
         """The adjoint of each element; see `solve_adjoint`. The address of what is not there is 0."""
         sources  # noqa: B018 - in the closure, for numba's cache
         singular, dependent = (n * 1e-7, 1e-5) if single_precision else (n * EPS, 1e-11)
-        A = matrix(scratch, 0, n, n)
-        x, rest = vector(scratch, n * n, n), vector(scratch, n * n + n, n)
-        r, s = vector(scratch, n * n + 2 * n, n), vector(scratch, n * n + 3 * n, n)
-        f = n * n + 4 * n
-        rows, cols, index = integers(scratch, f, n), integers(scratch, f + n, n), integers(scratch, f + 2 * n, n)
+        at = address(scratch)
+        A, at = matrix(at, n, n), at + 8 * n * n
+        x, rest, r, s = vector(at, n), vector(at + 8 * n, n), vector(at + 16 * n, n), vector(at + 24 * n, n)
+        rows, cols, index = integers(at + 32 * n, n), integers(at + 40 * n, n), integers(at + 48 * n, n)
         Ms, zs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(pointer(z_at, 0.0), (B, n))
         bases, statuses = numba.carray(pointer(basis_at, False), (B, n)), numba.carray(pointer(status_at, 0), (B,))
         grads_z, grads_w = numba.carray(pointer(grad_z_at, 0.0), (B, n)), numba.carray(pointer(grad_w_at, 0.0), (B, n))

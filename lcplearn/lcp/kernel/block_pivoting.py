@@ -1,7 +1,9 @@
 """Refinement of a solution at a basis, and block principal pivoting."""
 
-from lcplearn.lcp.kernel.dense import factor, factor_call, gather, gather_call, members, solve
-from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, STUCK, jit, jit_call, jit_inline, jit_merged
+import numpy as np
+
+from lcplearn.lcp.kernel.dense import COMPLETE, PARTIAL, factor, factor_call, gather, gather_call, members, solve
+from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, STUCK, jit, jit_inline, jit_merged
 from lcplearn.lcp.kernel.judging import evaluate
 
 
@@ -30,7 +32,7 @@ def refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch):
         evaluate(S, p, z, w, omega)
 
 
-@jit
+@jit_merged
 def polish(S, p, basis, T, place, inverted, A, rows, cols, index, z, w, omega, x, scratch):
     """Refine z on the basis from the data, by the tableau's inverse of S_AA (if inverted) or else by LU.
 
@@ -64,11 +66,41 @@ def polish(S, p, basis, T, place, inverted, A, rows, cols, index, z, w, omega, x
             noise = 4.0 * EPS * z_size
             evaluate(S, p, z, w, omega)
     k = gather_call(S, basis, A, index)
-    rank = factor_call(A, k, rows, cols, 4.0 * n * EPS, False)
+    rank = factor_call(A, k, rows, cols, 4.0 * n * EPS, PARTIAL)
     if rank < k:
         gather_call(S, basis, A, index)
-        rank = factor_call(A, k, rows, cols, 1e-11, True)
+        rank = factor_call(A, k, rows, cols, 1e-11, COMPLETE)
     refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch)
+
+
+@jit
+def leave_ray(S, basis, A, rows, cols, index, z, x):
+    """Move z >= 0 along null vectors of S_AA to where members of the basis become zero, and drop these.
+
+    z must be a solution; whether it still is one, is for the judge to say.
+    """
+    for _ in range(z.size):
+        k = gather_call(S, basis, A, index)
+        rank = factor_call(A, k, rows, cols, 1e-11, COMPLETE)
+        if rank == k:
+            break
+        x[rank] = total = 1.0
+        for a in range(rank - 1, -1, -1):
+            x[a] = -A[a, rank]
+            for c in range(a + 1, rank):
+                x[a] -= A[a, c] * x[c]
+            x[a] *= A[a, a]
+            total += x[a]
+        step, last = np.inf, 0
+        for a in range(rank + 1):
+            x[a] = x[a] if total >= 0.0 else -x[a]  # the way on which z shrinks
+            i = index[cols[a]]
+            if x[a] > 1e-11 and z[i] < step * x[a]:
+                step, last = z[i] / x[a], i
+        for a in range(rank + 1):
+            i = index[cols[a]]
+            z[i] = max(z[i] - step * x[a], 0.0)
+        z[last], basis[last] = 0.0, 0
 
 
 @jit_merged
@@ -78,7 +110,7 @@ def block_pivoting(S, p, basis, A, rows, cols, index, wrong, z, w, omega, x, scr
     fewest, patience = n + 1, 4
     for iteration in range(cap):
         k = gather(S, basis, A, index)
-        rank = factor(A, k, rows, cols, 16.0 * EPS, False)
+        rank = factor(A, k, rows, cols, 16.0 * EPS, PARTIAL)
         if rank < k:
             return STUCK, iteration
         for a in range(k):
@@ -109,6 +141,3 @@ def block_pivoting(S, p, basis, A, rows, cols, index, wrong, z, w, omega, x, scr
             for i in range(n):
                 basis[i] ^= wrong[i]
     return CAPPED, cap
-
-
-block_pivoting_call = jit_call(block_pivoting)

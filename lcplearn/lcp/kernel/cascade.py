@@ -5,7 +5,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from lcplearn.lcp.kernel.block_pivoting import block_pivoting, polish
+from lcplearn.lcp.kernel.block_pivoting import block_pivoting, leave_ray, polish
 from lcplearn.lcp.kernel.interior_point import interior_point
 from lcplearn.lcp.kernel.jit import (
     CAPPED,
@@ -33,13 +33,14 @@ from lcplearn.lcp.kernel.judging import (
     scale,
 )
 from lcplearn.lcp.kernel.lemke import lemke, prove_infeasible
-from lcplearn.lcp.kernel.memory import integers, matrix, pointer, vector
+from lcplearn.lcp.kernel.memory import address, pointer, workspace
 from lcplearn.lcp.kernel.scales import solve_by_scale
 
 # The stages in their order. BLOCK is block pivoting, where it is faster than Lemke's method; IMPROVE the same from what
 # LEMKE found, unless the residual is that of rounding. Then rows and columns are scaled apart: block pivoting, Lemke's
 # method, the same with an irregular covering vector, and with a finer pivot tolerance. PATH is the interior point, and
-# REFINED its solution refined, unless the residual is that of rounding: at a singular basis that can make it worse.
+# REFINED its solution refined, unless the residual is that of rounding: at a singular basis that can make it worse. A
+# solution that is far out on a ray of solutions, where digits of w are lost, leaves it first.
 # BY_SCALE goes one size of q down after the other from the best basis so far, ANEW from an empty one.
 BLOCK, LEMKE, IMPROVE, APART_BLOCK, APART_LEMKE, APART_COVER, APART_FINE, PATH, REFINED, BY_SCALE, ANEW = range(11)
 
@@ -80,10 +81,10 @@ def next_stage(stage, capped, budget):
 
 
 @jit_merged
-def run_stage(stage, left, budget, tol, single_precision, q, s, numbers, indices, basis_out):
+def run_stage(stage, left, budget, accepted, tol, single_precision, q, s, numbers, indices, basis_out):
     """Leave a candidate in z, w, omega and basis; how the stage ended, and its pivots or steps."""
     n = q.size
-    S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer = numbers
+    S, A, T, _, _, _, p, cover, z, w, omega, x, y, v, buffer = numbers
     rows, cols, index, basic, basis, column, place = indices
     ended, count = STUCK, 0
     if stage == APART_BLOCK:
@@ -95,7 +96,6 @@ def run_stage(stage, left, budget, tol, single_precision, q, s, numbers, indices
         pivot = prepare_lemke(stage, single_precision, cover)
         cap = left if budget >= 0 else 10 * n + 50
         ended, count = lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
-        polish(S, p, basis, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
     elif stage == PATH:
         count = interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, min(80, left))
         for i in range(n):
@@ -103,11 +103,14 @@ def run_stage(stage, left, budget, tol, single_precision, q, s, numbers, indices
             z[i] = z[i] if basis[i] else 0.0
         evaluate(S, p, z, w, omega)
     elif stage == REFINED:
-        polish(S, p, basis, T, place, False, A, rows, cols, index, z, w, omega, x, y)
+        if accepted:
+            leave_ray(S, basis, A, rows, cols, index, z, x)
     else:
         for i in range(n):
             basis[i] = basis_out[i] and stage == BY_SCALE
-        count = solve_by_scale(q, S, p, d, r, c, s, A, rows, cols, index, basic, basis, z, w, omega, x, y, tol, left)
+        count = solve_by_scale(address(S), n, address(q), s, tol, left)
+    if stage < PATH or stage == REFINED:  # one place: numba compiles a function anew where it is called
+        polish(S, p, basis, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
     return ended, count
 
 
@@ -121,21 +124,23 @@ def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out
     S, _, T, d, r, c, p, cover, z, w, omega, x, _, v, buffer = numbers
     _, _, index, basic, basis, column, place = indices
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
-    s = scale(M, q, r, c, S, p)
-    stage = BLOCK - 1 if warm or n < 6 or n > 40 else BLOCK
+    first = BLOCK if warm or n < 6 or n > 40 else LEMKE
+    stage, s = first - 1, 1.0
     while stage < ANEW and not (accepted and ((stage != LEMKE and stage != PATH) or best <= 1e-3 * tol)):
         stage = next_stage(stage, capped, budget)
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
             capped = True
             break
-        if stage in (APART_BLOCK, PATH):
+        if stage in (first, APART_BLOCK, PATH):
             for i in range(n):
                 r[i] = c[i] = d[i]
             if stage == APART_BLOCK:
                 rescale(M, r, c, x)
             s = scale(M, q, r, c, S, p)
-        ended, count = run_stage(stage, left, budget, tol, single_precision, q, s, numbers, indices, basis_out)
+        ended, count = run_stage(
+            stage, left, budget, accepted, tol, single_precision, q, s, numbers, indices, basis_out
+        )
         used += count
         if stage in (BLOCK, IMPROVE, APART_BLOCK):
             if ended != DONE:
@@ -174,26 +179,14 @@ def _make(sources: str) -> Any:
         The last arguments are addresses of the fields of LCPSolution.
         """
         sources  # noqa: B018 - in the closure, for numba's cache
-        width = (n + 3) // 4 * 4  # whole vectors of 4 doubles
         Ms, qs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(pointer(q_at, 0.0), (B, n))
-        S, A, T = matrix(scratch, 0, n, n), matrix(scratch, n * n, n, n), matrix(scratch, 2 * n * n, n + 2, width)
-        f = 2 * n * n + (n + 2) * width
-        d, p, cover = vector(scratch, f, n), vector(scratch, f + n, n), vector(scratch, f + 2 * n, n)
-        z, w, omega = vector(scratch, f + 3 * n, n), vector(scratch, f + 4 * n, n), vector(scratch, f + 5 * n, n)
-        y, v, r = vector(scratch, f + 6 * n, n), vector(scratch, f + 7 * n, n), vector(scratch, f + 8 * n, n)
-        c, x = vector(scratch, f + 9 * n, n), vector(scratch, f + 10 * n, n + 2)
-        buffer = vector(scratch, f + 11 * n + 2, width)
         zs, ws = numba.carray(pointer(z_at, 0.0), (B, n)), numba.carray(pointer(w_at, 0.0), (B, n))
         us, bases = numba.carray(pointer(u_at, 0.0), (B, n)), numba.carray(pointer(basis_at, False), (B, n))
         residuals, statuses = numba.carray(pointer(residual_at, 0.0), (B,)), numba.carray(pointer(status_at, 0), (B,))
         iterations = numba.carray(pointer(iterations_at, 0), (B,))
-        f += 11 * n + 2 + width
-        rows, cols, index = integers(scratch, f, n), integers(scratch, f + n, n), integers(scratch, f + 2 * n, n)
-        basic, basis = integers(scratch, f + 3 * n, n), integers(scratch, f + 4 * n, n)
-        column, place = integers(scratch, f + 5 * n, n + 1), integers(scratch, f + 6 * n + 1, 2 * n + 1)
-        numbers = S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer
-        indices = rows, cols, index, basic, basis, column, place
-        # and that is all of it: at most 3 n^2 + 25 n + 13 numbers, as width <= n + 3
+        numbers, indices = workspace(address(scratch), n)
+        _, A, _, d, _, _, _, _, _, _, _, x, _, _, _ = numbers
+        _, _, _, _, basis, _, _ = indices
         unsolved = 0
         for b in range(B):
             Mb, qb = Ms[0 if shared else b], qs[b]
@@ -202,7 +195,8 @@ def _make(sources: str) -> Any:
                 zs[b, i], ws[b, i], bases[b, i], us[b, i] = 0.0, 0.0, False, 0.0
             residuals[b], statuses[b], iterations[b] = 0.0, SOLVED, 0
             if not (all_finite(qb) and all_finite(Mb)):
-                zs[b], ws[b] = np.nan, np.nan
+                for i in range(n):
+                    zs[b, i], ws[b, i] = np.nan, np.nan
                 residuals[b], statuses[b] = np.inf, NONFINITE_INPUT
                 continue
             if nonnegative(qb):
@@ -210,8 +204,6 @@ def _make(sources: str) -> Any:
                     ws[b, i] = qb[i]
                 continue
             equilibrate(Mb, A, x, d)
-            for i in range(n):
-                r[i] = c[i] = d[i]
             statuses[b], residuals[b], iterations[b] = solve_one(
                 Mb, qb, tol, single_precision, budget, warm, numbers, indices, zs[b], ws[b], bases[b], us[b]
             )

@@ -8,6 +8,10 @@ from lcplearn.lcp.kernel.jit import jit_call, jit_inline
 # and the test for that keeps LLVM from vectorising.
 
 
+# As numpy's bool they are no literals, for each of which numba would compile once more.
+PARTIAL, COMPLETE = np.bool_(False), np.bool_(True)
+
+
 @jit_inline
 def factor(A, k, rows, cols, threshold, complete):
     """LU of A[:k, :k] in place, with the reciprocal diagonal of U; the number of pivots above the threshold."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lcplearn.lcp.kernel.dense import factor_call, solve_call
+from lcplearn.lcp.kernel.dense import PARTIAL, factor_call, solve_call
 from lcplearn.lcp.kernel.jit import EPS, jit
 from lcplearn.lcp.kernel.judging import evaluate
 
@@ -33,7 +33,7 @@ def interior_point(S, p, A, rows, cols, z, w, omega, r, dz, dw, scratch, cap):
             for j in range(n):
                 A[i, j] = S[i, j]
             A[i, i] += w[i] / z[i]
-        if factor_call(A, n, rows, cols, 0.0, False) < n:
+        if factor_call(A, n, rows, cols, 0.0, PARTIAL) < n:
             return iteration
         sigma_mu = 0.0
         for corrector in range(2):

@@ -1,7 +1,10 @@
 """How functions are compiled and cached, and the constants that they share."""
 
 import hashlib
+import os
+import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +53,15 @@ def entry(make: Callable[[str], Callable[..., Any]]) -> Any:
 
     Args:
         make: Gets a digest of the kernel's files; the function it returns must hold that in its closure.
-
-    Without a cache where its folder cannot be found or written to.
     """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
-    function = make(digest.hexdigest())
+    return cached(make(digest.hexdigest()))
+
+
+def cached(function: Callable[..., Any]) -> Any:
+    """Compile a function with a cache on disk; without one where its folder cannot be found or written to."""
     try:
         compiled = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # "cannot cache function: no locator available"
@@ -76,3 +81,14 @@ def _without_disk_errors(save: Callable[..., None]) -> Callable[..., None]:
             return
 
     return save_or_not
+
+
+@cache
+def announce(compiled: Any, words: str) -> None:
+    """Say once, on a terminal, that this compiles, unless it lies in numba's cache."""
+    if not sys.stderr.isatty():
+        return
+    folder = getattr(compiled.stats, "cache_path", None)
+    start = Path(compiled.py_func.__code__.co_filename).stem + "."
+    if folder is None or not os.path.isdir(folder) or not any(f.startswith(start) for f in os.listdir(folder)):
+        sys.stderr.write(f"lcplearn: {words}\n")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, LARGEST, STUCK, jit, jit_inline
-from lcplearn.lcp.kernel.memory import add_multiple
+from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, LARGEST, STUCK, jit, jit_inline, jit_merged
+from lcplearn.lcp.kernel.memory import add_product, address
 
 # Equation i says: basic variable = T[n + 1, i] + sum_c T[c, i] * (nonbasic variable of column c), n + 1 columns, stored
 # one after the other: ratio tests and updates then run along contiguous memory (1.3 to 1.5 times as fast). Variables
@@ -49,16 +49,12 @@ def exchange(T, basic, column, place, row, c, factor, buffer):
     for i in range(rows):
         buffer[i] = T[c, i]
         T[c, i] = 0.0
-    buffer[row] = 1.0
-    T[c, row] = -1.0
     for j in range(T.shape[0]):
         factor[j] = -inverse * T[j, row]
-        T[j, row] = 0.0
-    # as signed integers: with an unsigned one numba would add up the address in floating point
-    target, source = np.int64(T.ctypes.data), np.int64(buffer.ctypes.data)
-    for j in range(T.shape[0]):
-        add_multiple(target, source, factor[j], rows // 4)
-        target += 8 * rows
+    factor[c] = inverse
+    add_product(address(T), address(factor), address(buffer), T.shape[0], rows // 4)
+    for j in range(T.shape[0]):  # not before: to load a vector of which a part has just been stored takes long
+        T[j, row] = factor[j]
     basic[row], column[c] = column[c], basic[row]
     place[basic[row]], place[column[c]] = row, -1 - c
 
@@ -104,7 +100,7 @@ def leaving_row(T, place, c, tolerance, ratio, tied):
     return tied[0]
 
 
-@jit
+@jit_merged
 def lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, basis, z, cap):
     """Follow Lemke's path until z_0 leaves; z and basis of the last dictionary, how it ended, and the pivots."""
     n = p.size
@@ -142,11 +138,11 @@ def prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, rati
     u[:] = 0.0
     for _ in range(cap):
         row = place[2 * n]
-        c, steepest = -1, -1e-11
+        c, steepest = n + 1, -1e-11
         for j in range(n + 1):
             if T[j, row] < steepest:
                 c, steepest = j, T[j, row]
-        if c < 0:
+        if c > n:
             break
         leaving = leaving_row(T, place, c, 1e-11, ratio, tied)
         if leaving < 0 or basic[leaving] == 2 * n:

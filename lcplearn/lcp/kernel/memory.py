@@ -3,11 +3,12 @@
 from typing import Any
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from lcplearn.lcp.kernel.jit import jit
+from lcplearn.lcp.kernel.jit import jit, jit_merged
 
 # numba counts references, atomically, for every array passed from function to function, and that takes longer than
 # solving a small problem (0.4 us instead of 0.2 for n = 2). So the kernels see bare views. Lifetime: a view is made
@@ -21,46 +22,92 @@ def _pointer_code(_, address, example):
     def codegen(context, builder, signature, args):
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
 
-    return types.CPointer(example)(types.uintp, example), codegen
+    return types.CPointer(example)(types.int64, example), codegen
 
 
 pointer: Any = intrinsic(_pointer_code)
 
 
-def _add_multiple_code(_, target, source, factor, blocks):
-    """target += factor * source for vectors of 4 doubles; LLVM's own vectoriser leaves rests of up to 15 to scalars."""
+def _add_product_code(_, target, factors, source, columns, blocks):
+    """target[j] += factors[j] * source for columns of vectors of 4 doubles, a block of rows after the other.
+
+    LLVM's own vectoriser leaves rests of up to 15 to scalars.
+    """
 
     def codegen(context, builder, signature, args):
-        four = ir.VectorType(ir.DoubleType(), 4)
-        undefined = ir.Constant(four, ir.Undefined)
-        target, source = (builder.inttoptr(address, four.as_pointer()) for address in args[:2])
-        f = builder.insert_element(undefined, args[2], ir.IntType(32)(0))
-        f = builder.shuffle_vector(f, undefined, ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4))
-        with cgutils.for_range(builder, args[3]) as loop:
-            t, s = builder.gep(target, [loop.index]), builder.gep(source, [loop.index])
-            product = builder.fmul(builder.load(s, align=8), f, flags=("contract",))
-            builder.store(builder.fadd(builder.load(t, align=8), product, flags=("contract",)), t, align=8)
+        double, i32 = ir.DoubleType(), ir.IntType(32)
+        four = ir.VectorType(double, 4)
+        target, source = (builder.inttoptr(args[i], four.as_pointer()) for i in (0, 2))
+        factors = builder.inttoptr(args[1], double.as_pointer())
+        with cgutils.for_range(builder, args[4]) as rows:
+            s = builder.load(builder.gep(source, [rows.index]), align=8)
+            start = builder.gep(target, [rows.index])
+            with cgutils.for_range(builder, args[3]) as column:
+                f = builder.load(builder.gep(factors, [column.index]))
+                f = builder.insert_element(ir.Constant(four, ir.Undefined), f, i32(0))
+                f = builder.shuffle_vector(f, f, ir.Constant(ir.VectorType(i32, 4), [0] * 4))
+                t = builder.gep(start, [builder.mul(column.index, args[4])])
+                product = builder.fmul(s, f, flags=("contract",))
+                builder.store(builder.fadd(builder.load(t, align=8), product, flags=("contract",)), t, align=8)
         return context.get_dummy_value()
 
-    return types.void(types.int64, types.int64, types.float64, types.intp), codegen
+    return types.void(types.int64, types.int64, types.int64, types.intp, types.intp), codegen
 
 
-add_multiple: Any = intrinsic(_add_multiple_code)
-
-
-@jit
-def matrix(memory, start, rows, columns):
-    """View of part of a vector of doubles."""
-    return numba.carray(pointer(memory.ctypes.data + 8 * start, 0.0), (rows, columns))
+add_product: Any = intrinsic(_add_product_code)
 
 
 @jit
-def vector(memory, start, size):
-    """View of part of a vector of doubles."""
-    return numba.carray(pointer(memory.ctypes.data + 8 * start, 0.0), (size,))
+def address(x):
+    """Where an array's numbers are; signed, as numba would add up an unsigned address in floating point."""
+    return np.int64(x.ctypes.data)
 
 
 @jit
-def integers(memory, start, size):
-    """The same part as integers."""
-    return numba.carray(pointer(memory.ctypes.data + 8 * start, 0), (size,))
+def vector(at, size):
+    """View of doubles at an address."""
+    return numba.carray(pointer(at, 0.0), (size,))
+
+
+@jit
+def matrix(at, rows, columns):
+    """View of doubles at an address."""
+    return numba.carray(pointer(at, 0.0), (rows, columns))
+
+
+@jit
+def integers(at, size):
+    """View of integers at an address."""
+    return numba.carray(pointer(at, 0), (size,))
+
+
+@jit
+def lines(numbers):
+    """Bytes of so many numbers in whole cache lines: vectors of 4 doubles then never cross one."""
+    return (numbers + 7) // 8 * 64
+
+
+@jit
+def scratch_size(n):
+    """Numbers of memory that `workspace` cuts up."""
+    return 3 * n * n + 25 * n + 198  # with room for whole cache lines
+
+
+@jit_merged
+def workspace(at, n):
+    """Arrays of doubles and of integers for an element of size n, from memory of `scratch_size(n)` numbers."""
+    width, at = (n + 3) // 4 * 4, (at + 63) // 64 * 64
+    square, line = lines(n * n), lines(n + 2)  # of x and buffer a little more is asked for than of the other vectors
+    S, A, T = matrix(at, n, n), matrix(at + square, n, n), matrix(at + 2 * square, n + 2, width)
+    at += 2 * square + lines((n + 2) * width)
+    d, r, c, p = vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n)
+    at += 4 * line
+    cover, z, w, omega = vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n)
+    at += 4 * line
+    x, y, v, buffer = vector(at, n + 2), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, width)
+    at += 3 * line + lines(width)
+    rows, cols, index = integers(at, n), integers(at + line, n), integers(at + 2 * line, n)
+    at += 3 * line
+    basic, basis, column = integers(at, n), integers(at + line, n), integers(at + 2 * line, n + 1)
+    place = integers(at + 3 * line, 2 * n + 1)
+    return (S, A, T, d, r, c, p, cover, z, w, omega, x, y, v, buffer), (rows, cols, index, basic, basis, column, place)

@@ -1,12 +1,18 @@
-"""Problems whose q holds sizes far apart, solved one size after the other."""
+"""Problems whose q holds sizes far apart, solved one size after the other; compiled when the first such one comes."""
+
+import ctypes
+from typing import Any
 
 import numpy as np
+from llvmlite import binding
+from numba import types
 
-from lcplearn.lcp.kernel.block_pivoting import block_pivoting_call
-from lcplearn.lcp.kernel.dense import factor_call, gather_call, solve_call
-from lcplearn.lcp.kernel.jit import DONE, EPS, STUCK, jit
-from lcplearn.lcp.kernel.judging import equilibrate, evaluate_call, judge_call, scale
+from lcplearn.lcp.kernel.block_pivoting import block_pivoting
+from lcplearn.lcp.kernel.dense import PARTIAL, factor_call, gather, solve_call
+from lcplearn.lcp.kernel.jit import DONE, EPS, STUCK, announce, entry, jit_merged
+from lcplearn.lcp.kernel.judging import equilibrate, evaluate_call, judge, scale
 from lcplearn.lcp.kernel.lemke import lemke
+from lcplearn.lcp.kernel.memory import address, integers, matrix, scratch_size, vector, workspace
 
 # Where q holds sizes far apart (a contact at rest, 1e-15, beside one that slides, 1), a path that is followed at the
 # large size decides the small rows by rounding. So: at a basis A exchange z_A and w_A. What is then far above zero in
@@ -14,7 +20,7 @@ from lcplearn.lcp.kernel.lemke import lemke
 # solution flips members of the basis. Then again one size down.
 
 
-@jit
+@jit_merged
 def point_of_basis(S, p, A, k, rows, cols, index, z, w, omega, x, scratch):
     """z with w_A = 0 from the factors of S_AA, of any sign, size by size: small entries hold digits of their own."""
     z[:] = 0.0
@@ -35,7 +41,7 @@ def point_of_basis(S, p, A, k, rows, cols, index, z, w, omega, x, scratch):
         evaluate_call(S, p, z, w, omega)
 
 
-@jit
+@jit_merged
 def exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch):
     """P: how z_A and w_I of the members answer to their w_A and z_I (the principal pivot transform, in part)."""
     for b in range(m):
@@ -58,64 +64,95 @@ def exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch):
             P[a, b] = total if abs(total) > 1e-13 * size else 0.0
 
 
-@jit
-def solve_small(P, small, flips, cap):
+@jit_merged
+def solve_small(P, small, flips, cap, scratch):
     """Lemke's method on P and small, scaled to 1, else block pivoting; which members are basic, and the pivots."""
     m = small.size
-    S, size, T = np.empty((m, m)), np.empty((m, m)), np.empty((m + 2, (m + 3) // 4 * 4))
-    d, p, z, w, omega, y = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    cover, ratio, buffer = np.ones(m), np.empty(m + 2), np.empty(m + 3)
-    basic, column, place = np.empty(m, np.int64), np.empty(m + 1, np.int64), np.empty(2 * m + 1, np.int64)
-    tied, rows, cols, other = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.int64)
-    equilibrate(P, size, ratio, d)
-    c = d.copy()
-    scale(P, small, d, c, S, p)
-    ended, count = lemke(S, p, cover, 1e-9, T, basic, column, place, buffer, ratio, tied, flips, z, cap)
+    numbers, indices = workspace(address(scratch), m)
+    S, A, T, d, r, c, p, cover, z, w, omega, x, y, _, buffer = numbers
+    rows, cols, index, basic, basis, column, place = indices
+    equilibrate(P, A, x, d)
+    for i in range(m):
+        r[i] = c[i] = d[i]
+        cover[i] = 1.0
+    scale(P, small, r, c, S, p)
+    ended, count = lemke(S, p, cover, 1e-9, T, basic, column, place, buffer, x, index, flips, z, cap)
     if ended == STUCK:
         for i in range(m):
-            other[i] = p[i] < 0.0
-        ended, rounds = block_pivoting_call(S, p, other, size, rows, cols, tied, basic, z, w, omega, ratio, y, 20)
+            basis[i] = p[i] < 0.0
+        ended, rounds = block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, 20)
         count += rounds
         if ended == DONE:
             for i in range(m):
-                flips[i] = other[i]
+                flips[i] = basis[i]
     return count
 
 
-@jit
-def solve_by_scale(q, S, p, d, r, c, s, A, rows, cols, index, members, basis, z, w, omega, x, scratch, tol, cap):
-    """Solve from the given basis down, one size of the unknowns after the other; the pivots taken."""
-    n = p.size
-    P, small, flips = np.empty((n, n)), np.empty(n), np.empty(n, np.int64)
-    size, pivots = np.inf, 0
-    for _ in range(8):
-        k = gather_call(S, basis, A, index)
-        if factor_call(A, k, rows, cols, 4.0 * n * EPS, False) < k:
-            break
-        point_of_basis(S, p, A, k, rows, cols, index, z, w, omega, x, scratch)
-        largest = 0.0
-        for i in range(n):
-            small[i] = z[i] if basis[i] else (w[i] if abs(w[i]) > 8.0 * EPS * omega[i] else 0.0)
-            largest = max(largest, small[i])
-            z[i] = max(z[i], 0.0)
-        evaluate_call(S, p, z, w, omega)
-        residual, limit = judge_call(q, S, p, d, r, c, s, z, w, omega, tol)
-        m, wrong = 0, 0
-        for i in range(n):
-            if small[i] <= 1e-7 * min(size, largest):
-                members[m], small[m] = i, small[i]
-                wrong += small[i] < 0.0
-                m += 1
-        if residual <= limit or wrong == 0 or pivots >= cap:
-            break
-        exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch)
-        part = np.ascontiguousarray(P[:m, :m])
-        pivots += solve_small(part, small[:m], flips[:m], cap - pivots)
-        size, changed = 0.0, 0
-        for a in range(m):
-            basis[members[a]] ^= flips[a]
-            changed += flips[a]
-            size = max(size, abs(small[a]))
-        if changed == 0:
-            break
-    return pivots
+def _make(sources: str) -> Any:
+    def solve_by_scale(at, n, q_at, s, tol, cap, scratch):
+        """Solve from the given basis down, one size of the unknowns after the other; the pivots taken.
+
+        Args:
+            at: Address of the element's `workspace`.
+            n: Its size.
+            q_at: Address of its q.
+            s, tol: As `judge` takes them.
+            cap: Largest number of pivots.
+            scratch: Memory of `scratch_size(n)` numbers for the smaller problems.
+        """
+        sources  # noqa: B018 - in the closure, for numba's cache
+        q = vector(q_at, n)
+        numbers, indices = workspace(at, n)
+        S, A, T, d, r, c, p, small, z, w, omega, x, y, _, _ = numbers
+        rows, cols, index, members, basis, flips, _ = indices
+        size, pivots = np.inf, 0
+        for _ in range(8):
+            k = gather(S, basis, A, index)
+            if factor_call(A, k, rows, cols, 4.0 * n * EPS, PARTIAL) < k:
+                break
+            point_of_basis(S, p, A, k, rows, cols, index, z, w, omega, x, y)
+            largest = 0.0
+            for i in range(n):
+                small[i] = z[i] if basis[i] else (w[i] if abs(w[i]) > 8.0 * EPS * omega[i] else 0.0)
+                largest = max(largest, small[i])
+                z[i] = max(z[i], 0.0)
+            evaluate_call(S, p, z, w, omega)
+            residual, limit = judge(q, S, p, d, r, c, s, z, w, omega, tol)
+            m, wrong = 0, 0
+            for i in range(n):
+                if small[i] <= 1e-7 * min(size, largest):
+                    members[m], small[m] = i, small[i]
+                    wrong += small[i] < 0.0
+                    m += 1
+            if residual <= limit or wrong == 0 or pivots >= cap:
+                break
+            P = matrix(address(T), m, m)
+            exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, y)
+            rest, flipped = vector(address(small), m), integers(address(flips), m)
+            pivots += solve_small(P, rest, flipped, cap - pivots, scratch)
+            size, changed = 0.0, 0
+            for a in range(m):
+                basis[members[a]] ^= flips[a]
+                changed += flips[a]
+                size = max(size, abs(small[a]))
+            if changed == 0:
+                break
+        return pivots
+
+    return solve_by_scale
+
+
+_solve_by_scale = entry(_make)
+
+
+@ctypes.CFUNCTYPE(*[ctypes.c_int64] * 4, ctypes.c_double, ctypes.c_double, ctypes.c_int64)
+def _compile_and_solve(at: int, n: int, q_at: int, s: float, tol: float, cap: int) -> int:
+    """What compiled code calls: a third of the kernel's compilation waits for a problem that needs it."""
+    announce(_solve_by_scale, "compiling a stage for q with sizes far apart, once on a machine: about 10 s")
+    return int(_solve_by_scale(at, n, q_at, s, tol, cap, np.empty(scratch_size.py_func(n))))
+
+
+_SYMBOL = "lcplearn_solve_by_scale"
+binding.add_symbol(_SYMBOL, ctypes.cast(_compile_and_solve, ctypes.c_void_p).value)
+_numbers = (types.int64, types.int64, types.int64, types.float64, types.float64, types.int64)
+solve_by_scale: Any = types.ExternalFunction(_SYMBOL, types.int64(*_numbers))

@@ -26,7 +26,7 @@ def workspace(C, nv):
     return (
         np.empty((n, n)), np.empty((n, n)), np.empty((C, C)), np.empty((C, n)), np.empty(n * n), np.empty(n),
         np.empty(n), np.empty(n), np.empty((C, 2)), np.empty(C), np.empty(n), np.empty(nv), np.empty(n), np.empty(C),
-        np.empty((C, 2)), np.empty(3 * n * n + 25 * n + 13), np.empty(4 * n + 8), np.empty(C), np.empty(C),
+        np.empty((C, 2)), np.empty(scratch_size(n)), np.empty(4 * n + 8), np.empty(C), np.empty(C),
     )  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""`benchmark against TREE`: the kernel's speed beside that of another checkout."""
