@@ -9,34 +9,31 @@ from inspect import unwrap
 from pathlib import Path
 from typing import Any
 
-import numba
 import torch
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from lcplearn.lcp import pivoting
+from lcplearn.lcp.kernel import jit
 
 LARGEST = 1.7976931348623157e308  # of all doubles
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
 def compiled(function: Any, cached: bool = False) -> Any:
-    """numba.njit; with a cache if asked for and a cache folder can be written."""
+    """Compiled as the layer's kernel is; with a cache on disk if asked for."""
     function = unwrap(function)  # in tests jaxtyping wraps every function
-    try:
-        return numba.njit(cache=cached, **_OPTIONS)(function)
-    except RuntimeError:  # "cannot cache function: no locator available"
-        return numba.njit(**_OPTIONS)(function)
+    return jit.cached(function) if cached else jit.jit(function)
 
 
 def fingerprint(*files: str) -> str:
-    """Of the sources of a compiled function, in this folder and beside it.
+    """Of the sources of a compiled function, in this folder and elsewhere.
 
     numba watches one file alone, but a closure's values are part of a function's key.
     """
     here = Path(__file__).parent
-    sources = [*sorted(here.glob("*.py")), *(here.parent / name for name in ("friction_lcp.py", *files))]
+    names = ("friction_lcp.py", "../lcp/kernel/memory.py", *files)
+    sources = [*sorted(here.glob("*.py")), *(here.parent / name for name in names)]
     return sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 

@@ -4,6 +4,7 @@ from math import sqrt
 
 import numpy as np
 
+from lcplearn.lcp.kernel.memory import scratch_size
 from lcplearn.scenes.contact_kernel.compiling import compiled
 from lcplearn.scenes.contact_kernel.rows import apply, condense, cone_rows, delassus, mass_norm, rotate, solve_lcp
 from lcplearn.scenes.friction_lcp import (
