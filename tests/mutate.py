@@ -48,6 +48,7 @@ def run_tests(tree: Path, mutation: Mutation, log: Path) -> None:
     arguments = [
         "-x",
         "-q",
+        "-n0",
         "-p",
         "no:cacheprovider",
         "-W",

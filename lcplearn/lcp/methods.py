@@ -43,11 +43,6 @@ TORCH_METHODS = {
 }
 
 
-def method_names() -> tuple[str, ...]:
-    """What `solve_lcp` takes for its method; a name that joins TORCH_METHODS is among them."""
-    return ("auto", "pivoting", *TORCH_METHODS)
-
-
 class Options(NamedTuple):
     """How to solve: the checked keywords of `solve_lcp`."""
 

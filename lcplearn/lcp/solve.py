@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lcplearn.lcp.compiled import traced_solve
 from lcplearn.lcp.gradient import differentiable_solve
-from lcplearn.lcp.methods import TORCH_METHODS, Options, method_names
+from lcplearn.lcp.methods import TORCH_METHODS, Options
 from lcplearn.lcp.residuals import default_tolerance
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.torch_internals import traced
@@ -96,6 +96,11 @@ def solve_lcp(
     if throw:
         solution.raise_if_unsolved()
     return solution
+
+
+def method_names() -> tuple[str, ...]:
+    """What `solve_lcp` takes for its method; a name that joins TORCH_METHODS is among them."""
+    return ("auto", "pivoting", *TORCH_METHODS)
 
 
 def check_options(method: str, tol: float | None, max_iter: int | None, smoothing: float) -> None:

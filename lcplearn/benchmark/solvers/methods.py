@@ -7,16 +7,15 @@ import numpy as np
 import torch
 
 from lcplearn.benchmark.solvers.peers import peers
-from lcplearn.lcp import methods as lcp_methods
 from lcplearn.lcp.residuals import TINY, default_tolerance, equilibrate, judge, multiply
 from lcplearn.lcp.solution import Status
-from lcplearn.lcp.solve import solve_lcp
+from lcplearn.lcp.solve import method_names, solve_lcp
 
 # Keywords of `solve_lcp`; a new method of the layer is here by itself.
 # The interior point ends on a basis, to rounding; stopped at a coarser tolerance it is the smoothed solution of
 # that complementarity.
 METHODS: dict[str, dict[str, Any]] = {
-    **{name: {"method": name} for name in lcp_methods.method_names() if name != "auto"},
+    **{name: {"method": name} for name in method_names() if name != "auto"},
     "smoothed 1e-10": {"smoothing": 1e-10},
     "smoothed 1e-7": {"smoothing": 1e-7},
     "smoothed 1e-4": {"smoothing": 1e-4},
