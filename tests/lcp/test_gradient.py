@@ -319,17 +319,29 @@ def test_kernel_and_torch_agree_on_which_blocks_are_singular(gap, singular):
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_what_is_small_in_a_singular_block_counts(method):
+    """Three contacts on two velocities, two of them the same: forces are not unique, velocities A' z are."""
+    A = torch.tensor([[1.0, 0.0], [1.0, 0.02], [1.0, 0.0]], dtype=torch.float64)
+    M = A @ A.T  # singular values 3, 3e-4, 0
+    z, dz = torch.ones(3, dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    _, slope = torch.func.jvp(lambda q: solve_lcp(M, q, method=method).z, (-M @ z,), (-M @ dz,))
+    torch.testing.assert_close(A.T @ slope, A.T @ dz, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_an_unsolved_element_has_no_slope_in_any_mode(method):
     """Forward mode, and reverse mode made of torch's operations (create_graph)."""
-    M = torch.stack((torch.eye(2), torch.tensor([[0.0, 1.0], [0.0, 1.0]])))
-    q = torch.tensor([[-1.0, 1.0], [-1.0, 0.0]])  # the second has no solution
-    assert solve_lcp(M, q, method=method).solved.tolist() == [True, False]
+    M = torch.stack(
+        (torch.eye(2), torch.tensor([[0.0, 1.0], [0.0, 1.0]]), torch.tensor([[torch.nan, 0.0], [0.0, 1.0]]))
+    )
+    q = torch.tensor([[-1.0, 1.0], [-1.0, 0.0], [-1.0, 1.0]])  # the second has no solution
+    assert solve_lcp(M, q, method=method).solved.tolist() == [True, False, False]
     _, tangents = torch.func.jvp(
         lambda M, q: solve_lcp(M, q, method=method)[:2], (M, q), (torch.ones_like(M), torch.ones_like(q))
     )
-    assert all(tangent[0].any() and not tangent[1].any() for tangent in tangents)
+    assert all(tangent[0].any() and not tangent[1:].any() for tangent in tangents)
     M, q = M.requires_grad_(), q.requires_grad_()
     solution = solve_lcp(M, q, method=method)
     for gradient in torch.autograd.grad((solution.z + solution.w).sum(), (M, q), create_graph=True):
         assert gradient[0].any()
-        assert not gradient[1].any()
+        assert not gradient[1:].any()
