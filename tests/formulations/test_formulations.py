@@ -241,6 +241,8 @@ def test_a_batch_is_its_elements_one_by_one_and_a_rollout_its_steps(name: str) -
     path = model.rollout(state, forces, friction)
     assert path.velocities.shape == (2, 3, 5, 1)
     assert path.mode.shape == (2, 3, 4, 1)
+    moved = path.positions[..., :-1, :] + DT * path.velocities[..., 1:, :]
+    torch.testing.assert_close(path.positions[..., 1:, :], moved, rtol=1e-12, atol=1e-12)
     one, measured = state[1, 2], None
     for k in range(4):
         measured = None if friction is None else friction[1, 2, k]

@@ -8,8 +8,9 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from lcplearn import solve_lcp
 from lcplearn.benchmark.problems.families import stacked_cubes
-from lcplearn.lcp.gradient import adjoint
+from lcplearn.lcp.gradient import adjoint, tangent
 from lcplearn.lcp.methods import TORCH_METHODS
+from lcplearn.lcp.solution import Status
 
 METHODS = ("pivoting", *(name for name, method in TORCH_METHODS.items() if method.general))
 FRICTION = [[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 0.0]]  # notes 2.5 with mass = dt = 1
@@ -326,6 +327,17 @@ def test_what_is_small_in_a_singular_block_counts(method):
     z, dz = torch.ones(3, dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     _, slope = torch.func.jvp(lambda q: solve_lcp(M, q, method=method).z, (-M @ z,), (-M @ dz,))
     torch.testing.assert_close(A.T @ slope, A.T @ dz, rtol=1e-9, atol=0)
+
+
+def test_a_block_that_is_regular_by_the_rounding_of_float32_alone_counts_as_singular():
+    A = torch.tensor([[1.0, 0.1], [1.0, 0.3], [1.0, 0.7]], dtype=torch.float64)
+    M = (A @ A.T).float()
+    assert 1e-9 < torch.linalg.svdvals(M.double())[-1] < 1e-6  # 0 but for rounding
+    dq = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float32)
+    basis, status = torch.ones(3, dtype=torch.bool), torch.tensor(Status.SOLVED)
+    dz, _ = tangent((M, torch.ones_like(dq), torch.zeros_like(dq), basis, status), None, dq, 0.0)
+    assert dz.any()
+    assert dz.abs().max() < 100  # 1e7 and more along the null vector
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -81,6 +81,12 @@ def test_summary_counts_statuses_and_kinks():
     assert summary["worst_residual"] <= 1e-15
 
 
+def test_the_worst_residual_of_a_summary_is_the_largest_of_the_solved():
+    solution = solve_lcp(torch.eye(1).expand(3, 1, 1), torch.tensor([[-1.0], [1.0], [torch.nan]]))
+    solution = solution._replace(residual=torch.tensor([1e-12, 3e-11, 1.0], dtype=torch.float64))
+    assert solution.summary()["worst_residual"] == 3e-11
+
+
 def test_repr_names_the_statuses_and_works_without_values():
     M, q = torch.stack([torch.eye(2), -torch.eye(2), torch.eye(2)]), -torch.ones(3, 2)
     text = repr(solve_lcp(M, q))

@@ -151,7 +151,7 @@ def test_equal_seeds_give_equal_parameters_and_others_do_not(tmp_path: Path) -> 
     data = tiny_data()
     found = []
     for run, seed in enumerate((3, 3, 4)):
-        torch.manual_seed(seed)
+        torch.manual_seed(3)  # equal starts: the seed of `fit` draws the batches
         model = MLP(dt=data.dt, width=8)
         short_fit(model, data, tmp_path / str(run), batch_size=16, seed=seed, epochs=2)
         found.append(parameters(model))
