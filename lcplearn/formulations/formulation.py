@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -126,7 +125,7 @@ class Formulation(nn.Module):
 
     def _predicted(self, windows: Windows) -> Float[Tensor, "B k nq_plus_nv"]:
         path = rollout(self.moving_each(len(windows.valid)), windows.states[:, 0], windows.drive)
-        return torch.cat((path.positions, path.velocities), dim=-1)[:, 1:]
+        return path.states[:, 1:]
 
     def velocity_error(
         self, predicted: Float[Tensor, "*batch nq_plus_nv"], measured: Float[Tensor, "*batch nq_plus_nv"]

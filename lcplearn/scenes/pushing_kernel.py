@@ -15,7 +15,8 @@ from math import sqrt
 
 import numpy as np
 
-from lcplearn.scenes.contact_kernel.compiling import LARGEST, compiled
+from lcplearn.lcp.kernel.jit import LARGEST
+from lcplearn.scenes.contact_kernel.compiling import compiled
 from lcplearn.scenes.pushing_lcp import SMALLEST_LOAD
 from lcplearn.scenes.pushing_step import DAMP_FROM, SETTLED
 

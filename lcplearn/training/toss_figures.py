@@ -1,7 +1,6 @@
 """Pictures of a tossed cube: a filmstrip, an animation, learned corners, contact modes along a toss."""
 
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,7 +40,7 @@ class Toss(NamedTuple):
 def median_toss(found: Predictions) -> Toss:
     """The toss whose error, position integral [% width] plus rotation integral [deg], is the median of all."""
     test, path, half_width = found.task.test, found.test, found.task.given["half_width"]
-    predicted = torch.cat((path.positions, path.velocities), dim=-1)
+    predicted = path.states
     scores = score_tosses(test.states, predicted, test.steps, half_width)
     error = scores["position integral [% width]"] + scores["rotation integral [deg]"]
     chosen = int(error.argsort()[len(error) // 2])
@@ -177,13 +176,6 @@ def error_against_tosses(
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
     return figure
-
-
-def as_png(figure: "Figure", dpi: int = 120) -> bytes:
-    """A figure as the bytes of a PNG."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return buffer.getvalue()
 
 
 def _frame(ax: Any, toss: Toss, row: int, limits: Sequence[tuple[float, float]]) -> None:

@@ -252,7 +252,7 @@ class OurSimulation:
             pushes = [[self.scene.push((step + 0.5) * self.dt)] for step in range(steps)]
             self.drives[steps] = Drive(self.setup.force + torch.tensor(pushes, dtype=torch.float64) * self.setup.push)
         path = rollout(stepped, start, self.drives[steps])
-        return torch.cat((path.positions, path.velocities), dim=-1)
+        return path.states
 
     @torch.no_grad()
     def path(self, steps: int) -> Path:

@@ -128,7 +128,7 @@ def _of_model(model: Formulation) -> PREDICTS:
 @torch.no_grad()
 def _roll(roll: Callable[[Tensor, Drive], Any], start: Tensor, steps: int) -> tuple[Tensor, Tensor | None]:
     path = roll(start, Drive(start.new_zeros(len(start), steps, 6)))
-    return torch.cat((path.positions, path.velocities), dim=-1), path.solved
+    return path.states, path.solved
 
 
 def figures(

@@ -17,8 +17,6 @@ from numba.extending import intrinsic
 from lcplearn.lcp import pivoting
 from lcplearn.lcp.kernel import jit
 
-LARGEST = 1.7976931348623157e308  # of all doubles
-
 
 def compiled(function: Any, cached: bool = False) -> Any:
     """Compiled as the layer's kernel is; with a cache on disk if asked for."""

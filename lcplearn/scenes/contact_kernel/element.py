@@ -4,7 +4,8 @@ from math import sqrt
 
 import numpy as np
 
-from lcplearn.scenes.contact_kernel.compiling import LARGEST, compiled
+from lcplearn.lcp.kernel.jit import LARGEST
+from lcplearn.scenes.contact_kernel.compiling import compiled
 from lcplearn.scenes.contact_kernel.cone import solve_cone
 from lcplearn.scenes.contact_kernel.rows import apply, cholesky, cone_rows, delassus, mass_norm, solve_lcp
 from lcplearn.scenes.friction_lcp import DEAD_ZONE, FULL_RANK, ROUNDING
