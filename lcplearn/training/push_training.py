@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,51 +62,60 @@ def fit_pushes(
         raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(dict(settings or describe(model)), sort_keys=False))
-    rows, parts, seconds = [], [], time.perf_counter()
-    bar = tqdm(total=len(data.splits) + 1, desc="cross-validation", unit="fit", disable=not progress)
-    for split in data.splits:
-        learner = copy.deepcopy(model)
-        for figures in learner.fit(data.pushes.take(split.train), data.outcome.take(split.train)):
-            bar.set_postfix({name: f"{value:.3g}" for name, value in figures.items()}, refresh=True)
-        with torch.no_grad():
-            parts.append(learner.predict(data.pushes.take(split.test)))
-        rows.append(split.test)
-        bar.update()
-    seconds, start = time.perf_counter() - seconds, time.perf_counter()
-    bar.set_description("fit to all")
-    for step, figures in enumerate(model.fit(data.pushes, data.outcome)):
-        bar.set_postfix({name: f"{value:.3g}" for name, value in figures.items()}, refresh=True)
-        if logger:
-            logger.log_metrics({f"train/{name}": value for name, value in figures.items()}, step=step)
-    train_seconds = time.perf_counter() - start
-    bar.update()
-    bar.close()
+    with tqdm(total=len(data.splits) + 1, desc="cross-validation", unit="fit", disable=not progress) as bar:
+        start = time.perf_counter()
+        judged, prediction = _cross_validate(model, data, bar)
+        cross_validated = time.perf_counter()
+        bar.set_description("fit to all")
+        for step, figures in enumerate(_fit(model, data, bar)):
+            if logger:
+                logger.log_metrics({f"train/{name}": value for name, value in figures.items()}, step=step)
+        seconds = {"train_seconds": time.perf_counter() - cross_validated}
+        seconds["cross_validation_seconds"] = cross_validated - start
     checkpoint = {"formulation": describe(model), "state_dict": model.state_dict()}
     replace(folder / "best.ckpt", lambda file: torch.save(checkpoint, file))
 
-    judged, prediction = _together(data, torch.cat(rows), parts)
     found = errors(model, judged, prediction)
     metrics = found.figures()
     report = format_score(metrics, intervals(found, judged), by_configuration(found, judged))
     metrics |= {"unsolved_share": 1.0 - float(prediction.solved.double().mean())}
-    metrics |= model.physical_parameters()
-    metrics |= {"train_seconds": train_seconds, "cross_validation_seconds": seconds}
+    metrics |= model.physical_parameters() | seconds
     metrics["parameters"] = sum(p.numel() for p in model.parameters() if p.requires_grad)
     write_figures(folder / "metrics.json", metrics)
     pictures = draw(model, judged, prediction)
     for name, figure in pictures.items():
         figure.savefig(folder / f"{name}.png", dpi=120)
     if logger:
-        logger.log_metrics({f"test/{name}": float(value) for name, value in metrics.items()})
-        if isinstance(logger, TensorBoardLogger):
-            for name, figure in pictures.items():
-                logger.experiment.add_figure(name, figure)
-        logger.finalize("success")
+        _log(logger, metrics, pictures)
     return PushResult(model, metrics, report, folder)
 
 
-def _together(data: PushData, rows: torch.Tensor, parts: list[PushPrediction]) -> tuple[PushData, PushPrediction]:
+def _fit(model: PushModel, data: PushData, bar: tqdm) -> Iterator[Mapping[str, float]]:
+    """Fit a model to pushes; the bar counts it and shows its figures as they come."""
+    for figures in model.fit(data.pushes, data.outcome):
+        bar.set_postfix({name: f"{value:.3g}" for name, value in figures.items()}, refresh=True)
+        yield figures
+    bar.update()
+
+
+def _cross_validate(model: PushModel, data: PushData, bar: tqdm) -> tuple[PushData, PushPrediction]:
     """All left-out pushes with their predictions; a push stands there as often as it was left out."""
+    rows, parts = [], []
+    for split in data.splits:
+        learner = copy.deepcopy(model)
+        for _ in _fit(learner, data.take(split.train), bar):
+            pass
+        with torch.no_grad():
+            parts.append(learner.predict(data.pushes.take(split.test)))
+        rows.append(split.test)
     force = None if parts[0].force is None else torch.cat([part.force for part in parts if part.force is not None])
     pose, solved = (torch.cat([getattr(part, name) for part in parts]) for name in ("pose", "solved"))
-    return data.take(rows), PushPrediction(pose, force, solved)
+    return data.take(torch.cat(rows)), PushPrediction(pose, force, solved)
+
+
+def _log(logger: Any, metrics: Mapping[str, Any], pictures: Mapping[str, Any]) -> None:
+    logger.log_metrics({f"test/{name}": float(value) for name, value in metrics.items()})
+    if isinstance(logger, TensorBoardLogger):
+        for name, figure in pictures.items():
+            logger.experiment.add_figure(name, figure)
+    logger.finalize("success")

@@ -1,0 +1,58 @@
+"""A training of a model of pushes: what judges it, and what it leaves."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pushes import push_arrays
+
+from lcplearn.datasets.pushes import PushData, read_pushes
+from lcplearn.formulations.pushing import PushModel, PushPrediction, Ridge
+from lcplearn.training.checkpoint import load
+from lcplearn.training.push_training import fit_pushes
+
+
+class Parrot(PushModel):
+    """Knows the end of every push that it was fitted to, and is 1 m off on others."""
+
+    def fit(self, pushes, outcome):
+        self.start, self.end = pushes.push.pose, outcome.pose
+        yield {"seen": float(len(self.end))}
+
+    def predict(self, pushes):
+        same = (pushes.push.pose[:, None] == self.start).all(-1)
+        pose = torch.where(same.any(1)[:, None], self.end[same.int().argmax(1)], 1.0 + pushes.push.pose)
+        return PushPrediction(pose, None, torch.ones(len(pose), dtype=torch.bool))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> PushData:
+    path = tmp_path_factory.mktemp("pushes") / "pushes.npz"
+    np.savez(path, **push_arrays(12))
+    return read_pushes(path, folds=3)
+
+
+def thing(data: PushData) -> dict:
+    return {"vertices": data.vertices.tolist(), "com": data.com.tolist(), "mass": data.mass}
+
+
+def test_no_push_is_judged_by_a_model_that_was_fitted_to_it(data: PushData, tmp_path: Path) -> None:
+    result = fit_pushes(Parrot(**thing(data)), data, folder=tmp_path / "run", progress=False)
+    assert result.metrics["position_mm"] > 900.0
+    torch.testing.assert_close(result.model.predict(data.pushes).pose, data.outcome.pose, rtol=0, atol=0)  # of all
+
+
+def test_a_run_leaves_its_model_its_figures_and_pictures_and_is_not_overwritten(data: PushData, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    result = fit_pushes(Ridge(**thing(data)), data, folder=folder, progress=False)
+    torch.testing.assert_close(
+        load(folder / "best.ckpt").predict(data.pushes).pose, result.model.predict(data.pushes).pose, rtol=0, atol=0
+    )
+    assert json.loads((folder / "metrics.json").read_text()) == result.metrics
+    assert list(folder.glob("*.png"))
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(ValueError, match="holds a run already"):
+        fit_pushes(Ridge(**thing(data)), data, folder=folder, progress=False)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
