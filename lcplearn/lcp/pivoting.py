@@ -30,6 +30,9 @@ from lcplearn.lcp.kernel.cascade import solve_range
 from lcplearn.lcp.kernel.jit import announce
 from lcplearn.lcp.kernel.memory import scratch_size
 from lcplearn.lcp.solution import LCPSolution
+from lcplearn.lcp.threads import in_slices, slice_size
+
+ADJOINT_SHARE = 0.3  # of the time of a solve; to decide on threads
 
 
 def solve_batch(
@@ -67,12 +70,23 @@ def solve_batch(
         tol = 2e-6 if single_precision else 1e-10
     budget = -1 if max_iter is None else max_iter
     announce(solve_range, "compiling the LCP kernel, once on a machine: about half a minute")
-    unsolved = solve_range(
-        status.numel(), n, M.dim() == 2, address(M), address(q), tol, single_precision, budget,
-        initial_basis is not None, np.empty(scratch_size.py_func(n)), address(z), address(w), address(basis),
-        address(residual), address(status), address(iterations), address(certificate),
-    )  # fmt: skip
-    return LCPSolution(z, w, basis, status, residual, iterations, certificate), unsolved
+    shared, warm, count = M.dim() == 2, initial_basis is not None, status.numel()
+
+    def solve(start: int, stop: int) -> int:
+        row = start * n
+        return solve_range(
+            stop - start, n, shared, address(M, 0 if shared else row * n), address(q, row), tol, single_precision,
+            budget, warm, np.empty(scratch_size.py_func(n)), address(z, row), address(w, row), address(basis, row),
+            address(residual, start), address(status, start), address(iterations, start), address(certificate, row),
+        )  # fmt: skip
+
+    size = slice_size(count, count * _seconds(n)) if torch.get_num_threads() > 1 else count
+    return LCPSolution(z, w, basis, status, residual, iterations, certificate), sum(in_slices(solve, count, size))
+
+
+def _seconds(n: int) -> float:
+    """Roughly what a problem takes, to decide on threads."""
+    return 5e-8 * n + 5e-9 * n**2 + 1e-10 * n**3
 
 
 def solve_adjoint(
@@ -102,12 +116,26 @@ def solve_adjoint(
         grad_M (or None) and grad_q [*batch, n]. Where M_AA is singular (redundant contacts, and the solver ended on an
         interior point), y solves the consistent part of the equations: the gradient of unique quantities is exact.
     """
-    n = z.shape[-1]
-    grad_q, grad_M = _empty(z.shape), _empty(M.shape) if need_M else None
-    adjoint_range(
-        status.numel(), n, M.dim() == 2, address(M), address(z), address(basis), address(status), address(grad_z),
-        address(grad_w), np.empty(n * n + 7 * n), single_precision, address(grad_M), address(grad_q),
-    )  # fmt: skip
+    n, shared, count = z.shape[-1], M.dim() == 2, status.numel()
+    grad_q, grad_M = _empty(z.shape), _empty(M.shape) if need_M and not shared else None
+
+    def solve(start: int, stop: int) -> Tensor | None:
+        row = start * n
+        part = _empty(M.shape) if need_M and shared else None
+        adjoint_range(
+            stop - start, n, shared, address(M, 0 if shared else row * n), address(z, row), address(basis, row),
+            address(status, start), address(grad_z, row), address(grad_w, row), np.empty(n * n + 7 * n),
+            single_precision, address(part) if shared else address(grad_M, row * n), address(grad_q, row),
+        )  # fmt: skip
+        return part
+
+    size = count
+    if shared or torch.get_num_threads() > 1:
+        size = slice_size(count, ADJOINT_SHARE * count * _seconds(n))
+    if shared:
+        size = max(size, n)  # the sums of slices then take no more memory than q
+    for part in in_slices(solve, count, size):  # in their order, so that no bit depends on the number of threads
+        grad_M = part if grad_M is None else grad_M if part is None else grad_M + part
     return grad_M, grad_q
 
 
@@ -116,8 +144,10 @@ def _empty(shape: tuple[int, ...], dtype: type = np.float64) -> Tensor:
     return torch.from_numpy(np.empty(shape, dtype))
 
 
-def address(x: Tensor | None) -> int:
-    """Where a tensor's numbers are, for the kernel; 0 for None. The caller holds the tensor until the kernel returns.
+def address(x: Tensor | None, start: int = 0) -> int:
+    """Where the numbers of a contiguous tensor are, from one of them on, for the kernel; 0 for None.
+
+    The caller holds the tensor until the kernel returns.
 
     Raises:
         RuntimeError: The tensor has no memory.
@@ -127,4 +157,4 @@ def address(x: Tensor | None) -> int:
     result = x.data_ptr()
     if result == 0 and x.numel():
         raise RuntimeError("a tensor without memory (fake, traced or torch's implicit zero) reached the LCP kernel")
-    return result
+    return result + start * x.element_size() if start else result

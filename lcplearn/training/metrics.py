@@ -179,12 +179,14 @@ def format_table(metrics: Mapping[str, float | None]) -> str:
 
 
 def describe_model(model: Formulation, task: Task) -> str:
-    """One line: what learns, how large it is, and from what."""
+    """One line: what learns, how large it is, from what, and on how many threads."""
     parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
     dtype = str(next(model.parameters()).dtype).removeprefix("torch.")
     steps = int(task.train.steps.sum())
     counted = f"{parameters} parameter{'s' * (parameters != 1)}"
-    return f"{type(model).__name__}: {counted} ({dtype}); {task.name}: {steps} training steps"
+    count = torch.get_num_threads()
+    threads = f"{count} thread{'s' * (count != 1)}"
+    return f"{type(model).__name__}: {counted} ({dtype}); {task.name}: {steps} training steps; {threads}"
 
 
 def _rollout_rmse(model: Formulation, path: Trajectory, recordings: Recordings, steps: int) -> float | None:

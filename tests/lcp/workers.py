@@ -1,5 +1,7 @@
 """What other processes run in test_torch_processes.py and test_devices.py; importable by name in a spawned process."""
 
+import threading
+
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -7,6 +9,7 @@ from torch.utils.data import Dataset
 
 from lcplearn import LCPLayer, solve_lcp
 from lcplearn.lcp import interior_point
+from lcplearn.lcp.threads import in_slices
 
 
 class SolvedProblems(Dataset):
@@ -17,6 +20,19 @@ class SolvedProblems(Dataset):
 
     def __getitem__(self, k: int) -> Tensor:
         return solve_lcp(2 * torch.eye(2, dtype=torch.float64), torch.full((2,), -k - 1.0, dtype=torch.float64)).z
+
+
+def threads_of_two_slices() -> int:
+    """How many threads take two slices that can only end together."""
+    torch.set_num_threads(2)
+    together = threading.Barrier(2, timeout=20.0)
+
+    def task(start: int, _: int) -> int:
+        if start < 2:
+            together.wait()
+        return threading.get_ident()
+
+    return len(set(in_slices(task, 16, 1)[:2]))
 
 
 class LearnedProblem(nn.Module):

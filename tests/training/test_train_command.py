@@ -68,7 +68,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_the_command_that_goes_on(tmp_path: Path)
 def test_a_run_says_what_it_does_and_where_it_put_it(tmp_path: Path) -> None:
     done = train(tmp_path, "trainer.max_epochs=3", "optimizer.lbfgs_after=2", *SMALL)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("Structured: 5 parameters (float64); sliding_block: 120 training steps")
+    assert done.stdout.startswith("Structured: 5 parameters (float64); sliding_block: 120 training steps; 1 thread")
     folder = tmp_path / re.findall(r"run folder: (\S+)", done.stdout)[0]
     metrics = json.loads((folder / "metrics.json").read_text())
     assert re.search(r"velocity_rmse\s+" + re.escape(f"{metrics['velocity_rmse']:.4g}"), done.stdout)

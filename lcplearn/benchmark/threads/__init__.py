@@ -1,0 +1,1 @@
+"""`benchmark threads`: what a second core gains, on an idle machine and on a busy one."""

@@ -1,0 +1,96 @@
+"""A batch in slices, which several threads take one after the other; for work that releases the GIL.
+
+Whoever comes takes the next slice, so that a thread that the machine starts late leaves its share to the others.
+"""
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from typing import TypeVar
+
+import torch
+
+Result = TypeVar("Result")
+
+WORTHWHILE = 0.5e-3  # work of a thread [s]: to wake one takes 20 to 30 microseconds
+SLICE = 0.125e-3  # work of a slice [s]
+MOST_SLICES = 256
+LATE = 0.2  # share of a call that waits for a helper's last slice: more means that the machine has other work
+LONGEST_PAUSE = 63  # calls without helpers, before they are tried again
+
+
+def slice_size(count: int, seconds: float) -> int:
+    """Elements of a slice, by the work alone: so sums over slices don't depend on the number of threads."""
+    slices = min(count, MOST_SLICES, int(seconds / SLICE)) if seconds >= 2 * WORTHWHILE else 1
+    return -(-count // max(slices, 1))
+
+
+def in_slices(task: Callable[[int, int], Result], count: int, size: int) -> list[Result]:
+    """What `task(start, stop)` returns for each slice of `range(count)`, in their order.
+
+    At most `torch.get_num_threads()` threads work, and this one is always among them.
+    """
+    if size >= count:
+        return [task(0, count)]
+    slices = deque((start, min(start + size, count)) for start in range(0, count, size))
+    results: dict[int, Result] = {}
+
+    def work() -> None:
+        while slices:
+            try:
+                start, stop = slices.popleft()
+            except IndexError:  # another thread was faster
+                return
+            results[start] = task(start, stop)
+
+    begun = time.perf_counter()
+    helpers = _start(work, min(torch.get_num_threads(), int(len(slices) * SLICE / WORTHWHILE)) - 1)
+    try:
+        work()
+    finally:
+        done = time.perf_counter()
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+        if helpers:
+            _pause.after(time.perf_counter() - done > LATE * (done - begun))
+    return [results[start] for start in sorted(results)]
+
+
+class _Pause:
+    """Calls to go without helpers. Where these come late, each pause is twice as long as the one before."""
+
+    def __init__(self) -> None:
+        self.length = self.left = 0
+
+    def over(self) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+    def after(self, late: bool) -> None:
+        self.length = min(2 * self.length + 1, LONGEST_PAUSE) if late else 0
+        self.left = self.length
+
+
+_pause = _Pause()
+
+
+def _start(work: Callable[[], None], count: int) -> list["Future[None]"]:
+    if count < 1 or not _pause.over():
+        return []
+    try:
+        return [_pool().submit(work) for _ in range(count)]
+    except RuntimeError:  # Python is about to end, and starts no thread any more
+        return []
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="lcplearn")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads

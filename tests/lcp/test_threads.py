@@ -1,0 +1,128 @@
+"""A batch on several threads: the same bits, none for small work, and none that a forked process lacks."""
+
+import multiprocessing
+import threading
+from concurrent.futures import Future, ProcessPoolExecutor
+
+import pytest
+import torch
+from lcp.oracles import planted, random_family
+from lcp.workers import threads_of_two_slices
+
+from lcplearn import solve_lcp
+from lcplearn.lcp import pivoting, threads
+
+
+@pytest.fixture(autouse=True)
+def _threads():
+    before = torch.get_num_threads()
+    threads._pause.after(late=False)
+    yield
+    torch.set_num_threads(before)
+
+
+def _everything(M, q, count):
+    """All fields of a solution and its gradients, found on so many threads."""
+    torch.set_num_threads(count)
+    M, q = M.clone().requires_grad_(), q.clone().requires_grad_()
+    solution = solve_lcp(M, q)
+    loss = (solution.z.square() + solution.w).sum()
+    return *(x.detach() for x in solution), *torch.autograd.grad(loss, (M, q))
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_every_bit_is_the_same_on_any_number_of_threads(shared, dtype):
+    generator = torch.Generator().manual_seed(0)
+    batch = 10_000
+    M = random_family("nonsymmetric definite", 1 if shared else batch, 8, generator)
+    q, _ = planted(M.expand(batch, 8, 8), generator)
+    M, q = (M[0] if shared else M).to(dtype), q.to(dtype)
+    assert threads.slice_size(batch, pivoting.ADJOINT_SHARE * batch * pivoting._seconds(8)) < batch
+    one, *others = (_everything(M, q, count) for count in (1, 2, 3))
+    for several in others:
+        assert all(torch.equal(a, b) for a, b in zip(one, several, strict=True))
+
+
+def test_a_shared_matrix_gets_the_sum_of_its_elements_gradients():
+    generator = torch.Generator().manual_seed(1)
+    M = random_family("nonsymmetric definite", 1, 6, generator)[0]
+    q, _ = planted(M.expand(20_000, 6, 6), generator)
+    shared, alone = _everything(M, q, 2)[-2], _everything(M.repeat(len(q), 1, 1), q, 1)[-2]
+    torch.testing.assert_close(shared, alone.sum(0), rtol=1e-10, atol=1e-10 * float(alone.abs().sum(0).max()))
+
+
+def test_several_threads_take_slices_and_the_results_are_in_the_order_of_the_batch():
+    assert threads_of_two_slices() == 2
+    assert threads.in_slices(lambda start, stop: (start, stop), 35, 2) == [(k, min(k + 2, 35)) for k in range(0, 35, 2)]
+
+
+def test_small_work_wakes_no_thread(monkeypatch):
+    def pool():
+        raise AssertionError("a pool was asked for")
+
+    monkeypatch.setattr(threads, "_pool", pool)
+    torch.set_num_threads(2)
+    generator = torch.Generator().manual_seed(0)
+    M = random_family("positive definite", 200, 8, generator)
+    q = planted(M, generator)[0].requires_grad_()
+    solve_lcp(M, q).z.sum().backward()
+    large = M.repeat(20, 1, 1)
+    with pytest.raises(AssertionError, match="a pool was asked for"):
+        solve_lcp(large, q.detach().repeat(20, 1))
+    torch.set_num_threads(1)
+    solve_lcp(large, q.detach().repeat(20, 1))
+
+
+class _LatePool:
+    """Its threads never begin."""
+
+    def submit(self, _):
+        self.last = Future()
+        return self.last
+
+
+class _EndedPool:
+    def submit(self, _):
+        raise RuntimeError("cannot schedule new futures after interpreter shutdown")
+
+
+@pytest.mark.parametrize("pool", [_LatePool(), _EndedPool()])
+def test_what_a_thread_has_not_begun_the_caller_does(monkeypatch, pool):
+    torch.set_num_threads(2)
+    monkeypatch.setattr(threads, "_pool", lambda: pool)
+    assert threads.in_slices(lambda start, stop: (start, stop), 10, 1) == [(k, k + 1) for k in range(10)]
+
+
+def test_an_error_on_another_thread_reaches_the_caller():
+    torch.set_num_threads(2)
+    helper_failed = threading.Event()
+    main = threading.get_ident()
+
+    def task(start, stop):
+        if threading.get_ident() != main:
+            helper_failed.set()
+            raise ValueError("of a helper")
+        helper_failed.wait(30.0)
+
+    with pytest.raises(ValueError, match="of a helper"):
+        threads.in_slices(task, 16, 1)
+
+
+def test_threads_that_come_late_are_left_alone_for_twice_as_many_calls_each_time():
+    pause = threads._Pause()
+    waits = []
+    for late in (True, True, True, False, False):
+        pause.after(late)
+        calls = 0
+        while not pause.over():
+            calls += 1
+        waits.append(calls)
+    assert waits == [1, 3, 7, 0, 0]
+
+
+@pytest.mark.slow
+def test_a_forked_process_has_threads_of_its_own_after_its_parent_has_used_some():
+    assert threads_of_two_slices() == 2
+    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as children:
+        assert children.submit(threads_of_two_slices).result(60) == 2
