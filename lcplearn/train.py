@@ -72,6 +72,7 @@ def train(config: DictConfig) -> float:
             stages=settings["stages"],
             epochs=trainer.pop("max_epochs"),
             batch_size=config.batch_size,
+            batches=config.batches,
             optimizer=hydra.utils.instantiate(config.optimizer, _convert_="all"),
             patience=config.patience,
             folder=run.runtime.output_dir,

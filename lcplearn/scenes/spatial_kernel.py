@@ -118,8 +118,16 @@ def _make_roll(sources: str) -> Any:
             states[b, 0] = start[b]
             mass_now[0] = m = mass[b]
             restitution, mu, mu_impact, compliance = numbers[b, 1], numbers[b, 2], numbers[b, 3], numbers[b, 5]
+            at_rest = False
             for t in range(T):
                 x, after = states[b, t], states[b, t + 1]
+                if at_rest and t > 1 and (states[b, t - 1, 7:] == 0.0).all() and (force[b, t] == force[b, t - 1]).all():
+                    after[:] = x  # the step before, again
+                    modes[b, t], solved[b, t] = modes[b, t - 1], solved[b, t - 1]
+                    if len(loads):
+                        loads[b, t], frictions[b, t] = loads[b, t - 1], frictions[b, t - 1]
+                        sticking[b, t] = sticking[b, t - 1]
+                    continue
                 for i in range(4):
                     q[i] = x[3 + i]
                 rotation(q, R)

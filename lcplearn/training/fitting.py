@@ -60,6 +60,7 @@ def fit(
     stages: Sequence[Mapping[str, Any]] = (),
     epochs: int = 200,
     batch_size: int | None = None,
+    batches: int | None = None,
     optimizer: Optimizer | None = None,
     patience: int | None = 5,
     folder: str | Path | None = None,
@@ -80,6 +81,7 @@ def fit(
         stages: What comes before, each with its epochs and what differs: lr, a shorter horizon, weights of loss terms.
         epochs: Epochs to train at most, those of stages included.
         batch_size: Windows in a batch; None for the full batch, which is best for these small models.
+        batches: Batches in an epoch, however many windows there are: see `WindowLoader`; None for all windows once.
         optimizer: Adam alone by default.
         patience: Validations without improvement after which to stop; None to go on.
         folder: Where the run is written; a new folder runs/DATE_TIME by default.
@@ -103,14 +105,16 @@ def fit(
     chosen, folder = trainer_arguments(trainer, epochs), _new_folder(folder)
     _check_agreement(model, data)
     planned = plan(stages, loss=loss, horizon=horizon, epochs=epochs, lr=optimizer.lr)
-    batches = windows(data.train, horizon)
+    cut = windows(data.train, horizon)
     validation = windows(data.validation, horizon if data.chosen_by == "rollout" else None)
     for stage in planned:
-        _try_once(model, batches.map(lambda values: values[:1]).first(stage.horizon), stage.loss)
-    loader = WindowLoader(batches, batch_size=batch_size, shuffle=batch_size is not None, seed=seed)
+        _try_once(model, cut.map(lambda values: values[:1]).first(stage.horizon), stage.loss)
+    loader = WindowLoader(cut, batch_size=batch_size, batches=batches, shuffle=batch_size is not None, seed=seed)
     every = chosen["check_val_every_n_epoch"]
-    used = {"seed": seed, "batch_size": batch_size, "optimizer": asdict(optimizer), "stages": list(map(dict, stages))}
-    used["data"] = described_data(data, settings)
+    used = {
+        "seed": seed, "batch_size": batch_size, "batches": batches, "optimizer": asdict(optimizer),
+        "stages": list(map(dict, stages)), "data": described_data(data, settings),
+    }  # fmt: skip
     module = FormulationModule(
         model, stages=planned, optimizer=optimizer, chosen_by=data.chosen_by, training=flat(used),
         log_every=every * (len(loader) if batch_size else 1),

@@ -41,8 +41,10 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
     for key in settings:
         if key not in vocabulary(conf, "")[0]:
             raise SettingsError(unknown(key, conf))
-    for key, kind in (("seed", "int"), ("threads", "int"), ("batch_size", "int | None"), ("patience", "int | None")):
-        _check_type(key, settings.get(key), kind)
+    for key in ("seed", "threads"):
+        _check_type(key, settings.get(key), "int")
+    for key in ("batch_size", "batches", "patience"):
+        _check_type(key, settings.get(key), "int | None")
     if settings["threads"] < 1:
         raise SettingsError(f"threads: expected at least 1, got {settings['threads']}")
     if settings["patience"] is not None and settings["patience"] < 1:
@@ -155,7 +157,7 @@ def _check_pushes(settings: Mapping[str, Any], conf: Path) -> None:
         content = yaml.safe_load((conf / group / f"{choice}.yaml").read_text())
         if any(settings[group].get(key) != value for key, value in content.items() if key != "defaults"):
             raise SettingsError(f"{group} can't be chosen with data=pushes: these models fit themselves.")
-    for key in ("batch_size", "ckpt_path"):
+    for key in ("batch_size", "batches", "ckpt_path"):
         if settings.get(key) is not None:
             raise SettingsError(f"{key} can't be set with data=pushes: a fit takes seconds and is done as a whole.")
 

@@ -109,6 +109,22 @@ def test_the_order_depends_on_seed_and_epoch_and_nothing_else():
     assert drawn(WindowLoader(numbered(5), shuffle=False)) == [[0, 1, 2, 3, 4]]
 
 
+def test_an_epoch_has_as_many_batches_as_asked_for_however_few_windows_there_are():
+    """From one toss a training would else end before it has left its start."""
+    few = drawn(WindowLoader(numbered(5), batch_size=4, batches=4))
+    assert [len(batch) for batch in few] == [4, 4, 4, 4]
+    order = [number for batch in few for number in batch]
+    for k in range(3):
+        assert sorted(order[5 * k : 5 * k + 5]) == [0, 1, 2, 3, 4]  # all of them before any comes again
+    assert order[:5] != order[5:10]
+    many = WindowLoader(numbered(50), batch_size=7, batches=2)
+    assert drawn(many) == drawn(WindowLoader(numbered(50), batch_size=7))[:2]
+    assert len(many) == 2
+    ranks = [WindowLoader(numbered(50), batch_size=7, batches=2, rank=rank, world_size=2) for rank in (0, 1)]
+    seen = [number for loader in ranks for batch in drawn(loader) for number in batch]
+    assert len(set(seen)) == len(seen) == 28
+
+
 def test_the_full_batch_is_the_default():
     assert len(WindowLoader(numbered(50))) == 1
 
@@ -117,6 +133,8 @@ def test_the_full_batch_is_the_default():
     ("name", "arguments"),
     [
         ("batch_size", {"batch_size": 0}),
+        ("batches", {"batches": 2}),
+        ("batches", {"batch_size": 2, "batches": 0}),
         ("rank", {"rank": 2, "world_size": 2}),
         ("rank, world_size", {"rank": 0}),
     ],

@@ -100,6 +100,30 @@ def test_a_box_is_exactly_at_rest_for_10000_steps(slope):
     assert (path.velocities == 0.0).all()
 
 
+def test_a_box_at_rest_moves_when_it_is_pushed_and_only_then():
+    """A rollout does not solve again what rests; its steps one by one are the judge."""
+    pytest.importorskip("numba")
+    push = torch.zeros(1, 24, 6)
+    push[:, 8:12, 0], push[:, 12:14, 0] = 1.0, 3.0
+    weights = torch.randn(1, 25, 13, generator=torch.Generator().manual_seed(0))
+    gradients, states = [], []
+    for steps in (24, 1):
+        force, mu = push.clone().requires_grad_(), torch.tensor([0.4], requires_grad=True)
+        scene, state, path = body(mu=mu), REST[None].clone(), [REST[None, None]]
+        for k in range(0, 24, steps):
+            path.append(scene.rollout(state, Drive(force[:, k : k + steps])).states[:, 1:])
+            state = path[-1][:, -1]
+        states.append(torch.cat(path, dim=1))
+        gradients.append(torch.autograd.grad((weights * states[-1]).sum(), (force, mu)))
+    assert torch.equal(states[0], states[1])
+    still = (states[0][0, :, 7:] == 0.0).all(-1)
+    assert still[:13].all()
+    assert not still[13]
+    assert still[-1]
+    for found, wanted in zip(*gradients, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
+
+
 def test_a_box_on_a_slope_sticks_just_above_the_friction_angle_and_slides_just_below():
     slope = 0.3
     gravity = 9.81 * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)])

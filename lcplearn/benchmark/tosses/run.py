@@ -115,7 +115,8 @@ def trained(experiment: str, number: int, seed: int, folder: Path) -> Formulatio
     result = fit(
         build(asked.func, data, **asked.keywords), data, horizon=loss.pop("horizon"), loss=loss,
         stages=instantiate(config.stages, _convert_="all"), epochs=trainer.pop("max_epochs"),
-        batch_size=config.batch_size, optimizer=instantiate(config.optimizer), patience=config.patience, seed=seed,
+        batch_size=config.batch_size, batches=config.batches, optimizer=instantiate(config.optimizer),
+        patience=config.patience, seed=seed,
         folder=folder, trainer={**trainer, "enable_progress_bar": False},
     )  # fmt: skip
     return result.model
