@@ -77,10 +77,10 @@ def fetch(source: Source, clone: Path) -> None:
 
 
 def make(source: Source, clone: Path, out: Path) -> dict[str, Path]:
-    """Convert a clone, check what came of it, and write the data files whole or not at all.
+    """Convert a clone, check what came of it, and write the data files whole or not at all; none is overwritten.
 
     Returns:
-        Path of each file, by name.
+        Path of each file that was written, by name.
 
     Raises:
         OSError: the folder of the recordings is missing, or a file can't be written.
@@ -93,7 +93,7 @@ def make(source: Source, clone: Path, out: Path) -> dict[str, Path]:
             f"{clone}: expected the recordings of commit {source.commit[:7]} (checksum {source.digest[:12]}), "
             f"got others ({found[:12]}); nothing was written"
         )
-    paths = {name: out / name for name in files}
+    paths = {name: out / name for name in files if not (out / name).exists()}
     for name, path in paths.items():
         # numpy types **arrays as flags
         replace(path, lambda file, arrays=files[name]: np.savez_compressed(file, **arrays))  # type: ignore[misc]
@@ -177,6 +177,8 @@ def main(arguments: list[str] | None = None) -> None:
     except (OSError, ValueError) as error:
         parser.exit(1, f"{error}\n")
     written = "".join(f"{path}\n" for path in paths.values())
+    if name not in paths:
+        written += f"{options.out / name} was there already, and stays as it is\n"
     sys.stdout.write(f"{written}licence of {name}: {source.licence}; LICENSE in {clone} goes with copies\n")
 
 

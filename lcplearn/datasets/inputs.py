@@ -50,9 +50,6 @@ def read_inputs(path: str | Path, space: Space = LINE) -> Inputs:
     if path.suffix not in (".csv", ".npz"):
         raise ValueError(f"{path}: expected a name that ends in .csv or .npz")
     arrays = _read_npz(path) if path.suffix == ".npz" else _read_csv(path, _force_names(space))
-    if "forces" not in arrays:
-        missing = next(name for name in _force_names(space) if name not in arrays)
-        raise ValueError(f"{path} has no column '{missing}'; it has {', '.join(arrays) or 'nothing'}.")
     tensors = {key: torch.as_tensor(value, dtype=torch.float64) for key, value in arrays.items()}
     forces, friction, state = tensors["forces"], tensors.get("friction"), tensors.get("state")
     for name, tensor in (("forces", forces), ("friction", friction), ("state", state)):
@@ -93,8 +90,9 @@ def _read_csv(path: Path, names: Sequence[str]) -> dict[str, Any]:
     twice = sorted({name for name in header if header.count(name) > 1})
     if twice:
         raise ValueError(f"{path}, line 1: there are several columns '{twice[0]}'.")
-    if not set(names) <= set(header):
-        return dict.fromkeys(header)
+    missing = [name for name in names if name not in header]
+    if missing:
+        raise ValueError(f"{path} has no column '{missing[0]}'; it has {', '.join(header) or 'nothing'}.")
     for line, cells in lines:
         if not any(cell.strip() for cell in cells):
             raise ValueError(f"{path}, line {line} is empty, but each line is one time step.")

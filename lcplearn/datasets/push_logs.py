@@ -1,22 +1,18 @@
-"""Convert the public raw logs of the pushes: python -m lcplearn.datasets.push_logs CLONE --out data/
+"""Turn the public raw logs of the pushes into the arrays of a data file; `lcplearn.datasets.get` writes it.
 
-CLONE is a clone of github.com/robinzhoucmu/MLab_EXP (Apache-2.0). A log is text: the number of pushes; for each push
+They are in github.com/robinzhoucmu/MLab_EXP (Apache-2.0). A log is text: the number of pushes; for each push
 the object's pose before and after (x y z [mm], quaternion, real part first), the number of force rows and the rows
 (time [s], fx fy [N] of the sensor), the number of robot rows and the rows (time [s], x y z [mm], quaternion of the
 tool).
 """
 
-import argparse
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-
-from lcplearn.datasets.pushes import FILE
 
 FOLDER = "PushExp/sensor_log"
 FEET = {
@@ -84,8 +80,6 @@ def parse(text: str) -> list[RawPush]:
         return [RawPush(rows(1, 7)[0], rows(1, 7)[0], rows(number(), 3), rows(number(), 8)) for _ in range(number())]
     except StopIteration:
         raise ValueError("the log ends in the middle of a push") from None
-    except RuntimeError as error:  # a StopIteration inside the list
-        raise ValueError("the log ends in the middle of a push") from error
 
 
 def convert(clone: Path) -> dict[str, NDArray]:
@@ -156,24 +150,3 @@ def _read(clone: Path, name: str) -> Iterator[RawPush]:
 
 def _offsets(parts: list[NDArray]) -> NDArray:
     return np.concatenate(([0], np.cumsum([len(part) for part in parts]))).astype(np.int64)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; what is wrong with a log ends it with one sentence."""
-    parser = argparse.ArgumentParser(prog="python -m lcplearn.datasets.push_logs", description=__doc__.split("\n\n")[0])
-    parser.add_argument("clone", type=Path, help="clone of github.com/robinzhoucmu/MLab_EXP")
-    parser.add_argument("--out", type=Path, default=Path("data"), help="folder to write to (default: data)")
-    options = parser.parse_args(arguments)
-    try:
-        if (options.out / FILE).exists():
-            raise ValueError(f"{options.out / FILE} is there already; nothing is overwritten.")
-        arrays = convert(options.clone)
-        options.out.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(options.out / FILE, **arrays)  # type: ignore[arg-type]
-    except (ValueError, OSError) as error:
-        sys.exit(str(error))
-    sys.stdout.write(f"{options.out / FILE}: {len(arrays['config'])} pushes\n")
-
-
-if __name__ == "__main__":
-    main()

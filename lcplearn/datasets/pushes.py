@@ -157,14 +157,22 @@ def straighten(path: Float[NDArray, "n 2"]) -> Float[NDArray, "2 2"]:
 
 def _configurations(path: Path | str, arrays: dict[str, NDArray]) -> NDArray:
     """Number of each push's configuration, after checking all shapes."""
-    count, configurations = len(arrays["config"]), len(arrays["config_name"])
+    count, configurations = arrays["config"].size, arrays["config_name"].size
+    corners = max((3, *arrays["object_vertices"].shape[:1]))
     shapes = {
-        "config": (count,), "pre_pose": (count, 3), "post_pose": (count, 3), "config_surface": (configurations,),
-        "config_support_points": (configurations, 3, 2), "object_com": (2,),
+        "config": (count,), "pre_pose": (count, 3), "post_pose": (count, 3), "config_name": (configurations,),
+        "config_surface": (configurations,), "config_support_points": (configurations, 3, 2), "object_com": (2,),
+        "object_vertices": (corners, 2),
     }  # fmt: skip
     for name, shape in shapes.items():
-        if name in arrays and arrays[name].shape != shape:
-            raise ValueError(f"{path}: {name}: expected shape {list(shape)}, got {list(arrays[name].shape)}")
+        if name not in arrays:
+            continue
+        kinds, what = {"config": ("iu", "integers"), "config_name": ("U", "text"), "config_surface": ("U", "text")}.get(
+            name, ("fiu", "numbers")
+        )
+        if arrays[name].shape != shape or arrays[name].dtype.kind not in kinds:
+            got = f"{arrays[name].dtype} {list(arrays[name].shape)}"
+            raise ValueError(f"{path}: {name}: expected {what} of shape {list(shape)}, got {got}")
     config = arrays["config"].astype(np.int64)
     if count == 0 or config.min() < 0 or config.max() >= configurations:
         raise ValueError(f"{path}: config: expected numbers from 0 to {configurations - 1} for at least one push")
@@ -173,7 +181,7 @@ def _configurations(path: Path | str, arrays: dict[str, NDArray]) -> NDArray:
 
 def _records(path: Path | str, arrays: dict[str, NDArray], name: str) -> list[NDArray]:
     rows, offsets = arrays[name], arrays[f"{name}_offsets"]
-    if rows.ndim != 2 or rows.shape[1] != 3 or len(offsets) != len(arrays["config"]) + 1:
+    if rows.ndim != 2 or rows.shape[1] != 3 or rows.dtype.kind == "U" or offsets.size != len(arrays["config"]) + 1:
         raise ValueError(f"{path}: {name}: expected rows of 3 numbers for {len(arrays['config'])} pushes")
     check_offsets(path, offsets, len(rows))
     return np.split(rows.astype(np.float64), offsets[1:-1])

@@ -136,6 +136,8 @@ def read_recordings(
     tensors = {name: _tensor(path, name, arrays[name], shape) for name, shape in shapes.items() if name in arrays}
     if ndim == 2:
         tensors |= {name: tensors[name].unsqueeze(-1) for name in columns if name in tensors}
+    if "true_positions" in tensors and "true_velocities" not in tensors:
+        raise ValueError(f"{path}: true_velocities: expected beside true_positions, got none")
     positions, true = tensors["positions"], None
     if "true_velocities" in tensors:
         true = torch.cat((tensors.get("true_positions", positions), tensors["true_velocities"]), dim=-1)

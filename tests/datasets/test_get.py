@@ -71,6 +71,12 @@ def test_one_command_makes_both_files_of_a_clone_and_prints_licence_and_place(pu
     assert "BSD-3-Clause" in printed
     assert str(tmp_path / "out" / "cube_tosses.npz") in printed
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["cube_slides.npz", "cube_tosses.npz"]
+    (tmp_path / "out" / "cube_tosses.npz").write_bytes(b"mine")
+    (tmp_path / "out" / "cube_slides.npz").unlink()
+    get.main(["tosses", "--out", str(tmp_path / "out"), "--source", str(clone)])
+    assert (tmp_path / "out" / "cube_tosses.npz").read_bytes() == b"mine"
+    assert (tmp_path / "out" / "cube_slides.npz").exists()
+    assert "cube_tosses.npz was there already, and stays as it is" in capsys.readouterr().out
 
 
 def test_without_a_network_one_sentence_says_what_to_do(published, tmp_path, monkeypatch, capsys):

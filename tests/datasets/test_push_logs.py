@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lcplearn.datasets.push_logs import FOLDER, LOGS, force_on_object, main, parse, plane_pose, yaw
+from lcplearn.datasets.push_logs import FOLDER, LOGS, convert, force_on_object, parse, plane_pose, yaw
 from lcplearn.datasets.pushes import read_all_pushes
 
 
@@ -39,8 +39,8 @@ def clone(tmp_path):
 
 
 def test_the_converted_file_is_one_that_can_be_read(clone, tmp_path):
-    main([str(clone), "--out", str(tmp_path / "data")])
-    data = read_all_pushes(tmp_path / "data" / "planar_pushes.npz")
+    np.savez(tmp_path / "planar_pushes.npz", **convert(clone))
+    data = read_all_pushes(tmp_path / "planar_pushes.npz")
     assert len(data.configuration) == 20
     assert int(data.pushes.whole_face.sum()) == 4
     way = data.pushes.push.end - data.pushes.push.start
@@ -66,10 +66,6 @@ def test_a_log_that_ends_early_is_refused():
         parse("\n".join(log(2).splitlines()[:-5]))
 
 
-def test_nothing_is_overwritten_and_a_folder_that_is_no_clone_is_named(clone, tmp_path):
-    (tmp_path / "planar_pushes.npz").write_text("mine")
-    with pytest.raises(SystemExit, match="overwritten"):
-        main([str(clone), "--out", str(tmp_path)])
-    assert (tmp_path / "planar_pushes.npz").read_text() == "mine"
-    with pytest.raises(SystemExit, match="no clone"):
-        main([str(tmp_path), "--out", str(tmp_path / "elsewhere")])
+def test_a_folder_that_is_no_clone_is_named(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path} is no clone"):
+        convert(tmp_path)

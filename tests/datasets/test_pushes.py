@@ -100,6 +100,12 @@ def test_the_same_seed_draws_the_same_parts(file):
         ({"pusher": np.zeros((10, 3))}, "offsets"),
         ({"pre_pose": np.full((12, 3), np.nan)}, "pre_pose"),
         ({"object_mass": np.float64(-1.0)}, "object_mass"),
+        ({"config": np.array(1)}, "config: expected integers of shape"),
+        ({"config": np.full(12, 0.6)}, "config: expected integers of shape"),
+        ({"config_name": np.array("a")}, "config_name"),
+        ({"pusher_offsets": np.array(1)}, "pusher"),
+        ({"pre_pose": np.full((12, 3), "a")}, "pre_pose: expected numbers of shape"),
+        ({"object_vertices": np.zeros(4)}, "object_vertices"),
     ],
 )
 def test_a_file_that_is_not_as_described_is_refused_by_name(file, changes, named):
