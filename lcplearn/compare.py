@@ -25,11 +25,15 @@ if TYPE_CHECKING:
 
 Value = float | None
 # Settings that change nothing in what is learned; any other difference makes another row.
-_SILENT = ("seed", "data.seed", "ckpt_path", "allow_changes", "logger.", "trainer.enable_progress_bar", "resumed.from")
+_SILENT = (
+    "seed", "data.seed", "model.seed", "ckpt_path", "allow_changes", "logger.", "trainer.enable_progress_bar",
+    "resumed.from",
+)  # fmt: skip
 # The far error that a picture shows: the first of these that a run has.
 _FAR = {
     "deviation_mm": "deviation of end poses [mm]",
     "stop_error_median_mm": "where a slide stops: median error [mm]",
+    "position_integral": "position error of a toss [% of width]",
     "rollout_rmse_1000": "error over 1000 steps [m/s]",
     "rollout_rmse_100": "error over 100 steps [m/s]",
 }
@@ -106,9 +110,11 @@ def draw(rows: Sequence[Row]) -> "Figure":
     from matplotlib.figure import Figure
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-    far = next((key for key in _FAR if any(row.values.get(key) for row in rows)), None)
+    there = {key for row in rows for key, value in row.values.items() if value is not None}
+    far = next((key for key in _FAR if key in there), None)
     panels = [("predict_us", "velocity_rmse", "time of a step [us]", "error of a step [m/s]")]
     if far is not None:
+        panels = panels if "velocity_rmse" in there else []
         panels.append(("train_seconds", far, "time of training [s]", _FAR[far]))
     figure = Figure(figsize=(4.6 * len(panels) + 2.6, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
@@ -226,8 +232,8 @@ def _figure(value: Any) -> Value:
 
 
 def _error(row: Row) -> float:
-    """What rows are sorted by: the error of end poses, of stops, or else of one step."""
-    found = (row.values["deviation_mm"], row.values["stop_error_median_mm"], row.values["velocity_rmse"])
+    """What rows are sorted by: the error of end poses, of stops, of tosses, or else of one step."""
+    found = (row.values[key] for key in ("deviation_mm", "stop_error_median_mm", "position_integral", "velocity_rmse"))
     return next((value for value in found if value is not None), math.inf)
 
 

@@ -73,6 +73,18 @@ def test_an_error_of_exactly_zero_comes_first(tmp_path: Path) -> None:
     assert [row.label for row in compare.read_runs([tmp_path])] == ["ReLU", "MLP"]
 
 
+def test_tosses_are_sorted_drawn_and_joined_over_seeds_of_their_models(tmp_path: Path) -> None:
+    for seed, error in enumerate((9.0, 8.0)):
+        config = {"seed": seed, "model": {"_target_": "here.CubeCorners", "seed": seed}}
+        run(tmp_path / f"a{seed}", "", config, position_integral=error, train_seconds=1.0, predict_us=9.0)
+    run(tmp_path / "b", "baselines.MLP", position_integral=0.0, train_seconds=1.0, predict_us=9.0)
+    rows = compare.read_runs([tmp_path])
+    assert [(row.label, row.seeds) for row in rows] == [("MLP", 1), ("CubeCorners", 2)]
+    (ax,) = compare.draw(rows).axes
+    assert ax.get_ylabel() == "position error of a toss [% of width]"
+    assert [float(line.get_ydata()[0]) for line in ax.lines] == [1e-17, 8.5]
+
+
 def test_a_row_is_named_by_what_sets_it_apart(tmp_path: Path) -> None:
     for horizon in (1, 10):
         config = {"loss": {"horizon": horizon}, "logger": {"save_dir": f"runs/{horizon}"}}
