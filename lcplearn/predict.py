@@ -30,7 +30,7 @@ from lcplearn.datasets.files import find, read_npz
 from lcplearn.datasets.inputs import FRICTION, Inputs, read_inputs
 from lcplearn.formulations import Formulation
 from lcplearn.formulations.pushing import PushModel
-from lcplearn.scenes.scene import Mode, Trajectory
+from lcplearn.scenes.scene import STICK_SPEED, Trajectory
 from lcplearn.training.checkpoint import load
 from lcplearn.training.motion import draw, write
 
@@ -112,6 +112,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.score and (options.state or options.plot):
         parser.error("--state and --plot go with --input")
+    read = {Path(path).resolve() for path in (options.checkpoint, options.input or options.score)}
+    for written in filter(None, (options.output, options.plot)):
+        if Path(written).resolve() in read:
+            sys.exit(f"{written} is what is read: choose another name, nothing is overwritten.")
     try:
         _score(options) if options.score else _predict(options)
     except OSError as error:
@@ -127,7 +131,8 @@ def _predict(options: argparse.Namespace) -> None:
     state = None if options.state is None else torch.tensor(options.state, dtype=torch.float64)
     inputs = read_inputs(options.input, model.space)
     trajectory = predict(model, inputs, state)
-    steps, stuck = trajectory.mode.shape[-2], float((trajectory.mode == Mode.STICK).double().mean())
+    speed = model.space.speed(trajectory.velocities[..., 1:, :], model.radius)
+    steps, still = trajectory.mode.shape[-2], float((speed < STICK_SPEED).double().mean())
     if options.output:
         write(options.output, trajectory, model)
     if options.plot:
@@ -140,7 +145,7 @@ def _predict(options: argparse.Namespace) -> None:
     several = f"{len(trajectory.mode)} trajectories of " if trajectory.mode.ndim > 2 else ""
     print(
         f"{type(model).__name__}: {several}{steps} step{'s' * (steps > 1)} of {model.dt:.4g} s, "
-        f"at rest in {stuck:.0%} of them{warning}"
+        f"at rest after {still:.0%} of them{warning}"
     )
 
 
@@ -152,7 +157,7 @@ def _score(options: argparse.Namespace) -> None:
     if isinstance(model, PushModel):
         from lcplearn.training.push_scoring import score_pushes
 
-        print(score_pushes(model, options.score, options.output))
+        print(score_pushes(model, _found(options.score), options.output))
         return
     if "state" in read_npz(_found(options.score), (), optional=("state",), finite=False):
         _score_tosses(model, options)

@@ -16,7 +16,9 @@ from lcplearn import predict
 from lcplearn.datasets import Task
 from lcplearn.datasets.cube_slides import COLUMNS
 from lcplearn.datasets.inputs import read_inputs
-from lcplearn.formulations import Direct, Physical, Structured
+from lcplearn.formulations import Direct, Identified, Physical, Structured
+from lcplearn.scenes.planar_body import PlanarBody, rectangle
+from lcplearn.training.checkpoint import describe
 from lcplearn.training.metrics import evaluate
 
 FORCES = [0.0, 3.0, 12.0, -9.0, -9.0, 0.5, 0.0]
@@ -84,6 +86,30 @@ def test_an_npz_batch_predicts_all_its_trajectories(checkpoint: Path, tmp_path: 
         predict.main([str(checkpoint), "--input", str(tmp_path / "in.npz"), "--output", str(tmp_path / "out.csv")])
 
 
+def test_a_body_is_at_rest_where_it_does_not_move_not_where_one_of_its_contacts_sticks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A rectangle stands on two of its four corners: the others are separate."""
+    body = rectangle(0.06, 0.04)
+    given = {"mass": 0.4, "inertia": 7e-4, "corners": body.tolist()}
+    model = Identified(scene=PlanarBody, dt=0.01, learn={"mu": 0.5}, given=given)
+    state = {f"model.{name}": value for name, value in model.state_dict().items()}
+    torch.save({"formulation": describe(model), "state_dict": state}, tmp_path / "body.ckpt")
+    np.savez(tmp_path / "in.npz", forces=np.zeros((4, 3)), state=[0.0, 0.04, 0.0, 0.0, 0.0, 0.0])
+    predict.main([str(tmp_path / "body.ckpt"), "--input", str(tmp_path / "in.npz")])
+    assert "at rest after 100% of them" in capsys.readouterr().out
+
+
+def test_what_is_read_is_not_overwritten(checkpoint: Path, tmp_path: Path) -> None:
+    path = forces_csv(tmp_path)
+    before = path.read_bytes()
+    with pytest.raises(SystemExit, match=r"forces\.csv is what is read: choose another name"):
+        predict.main([str(checkpoint), "--input", str(path), "--output", str(tmp_path / "x" / ".." / "forces.csv")])
+    with pytest.raises(SystemExit, match=r"best\.ckpt is what is read"):
+        predict.main([str(checkpoint), "--score", "any.npz", "--output", str(checkpoint)])
+    assert path.read_bytes() == before
+
+
 def test_a_model_of_measured_friction_asks_for_its_columns(needs_friction: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="needs measured friction: the columns friction_plus and friction_minus"):
         predict.main([str(needs_friction), "--input", str(forces_csv(tmp_path))])
@@ -107,6 +133,7 @@ def test_scoring_the_test_recordings_gives_the_figures_of_the_run(checkpoint: Pa
     ("header", "rows", "message"),
     [
         ("time,Force", None, "has no column 'force'; it has time, Force"),
+        ("forces", ["1"], "has no column 'force'; it has forces"),
         ("force", ["1.0", "x"], "line 3: force: expected a number, got 'x'"),
         ("force", ["1.0", "nan"], "forces: expected finite numbers"),
         ("force", [""], "forces: expected at least one step"),
