@@ -43,6 +43,8 @@ class CubeCorners(Identified):
         flat: bool = True,
         clip: float | None = None,
     ) -> None:
+        if "half_width" not in given:
+            raise ValueError(f"given: expected the half_width of a cube, got {', '.join(given) or 'none'}")
         half_width, generator = given["half_width"], torch.Generator().manual_seed(seed)
         cube = box_corners(torch.full((3,), half_width, dtype=torch.float64))
         start = cube + noise * half_width * torch.randn(8, 3, generator=generator, dtype=torch.float64)

@@ -105,7 +105,8 @@ class Formulation(nn.Module):
 
     def prediction_error(self, windows: Windows) -> Float[Tensor, " B"]:
         """Squared error of the velocity after the first step of each window [m^2/s^2]."""
-        after = self.advance(windows.states[:, 0], windows.drive.at(0)).state
+        moving = self.moving_each(len(windows.valid))
+        after = moving.advance(windows.states[:, 0], windows.drive.at(0)).state
         return self.velocity_error(after, windows.states[:, 1])
 
     def rollout_error(self, windows: Windows) -> Float[Tensor, "B k"]:
@@ -155,6 +156,9 @@ def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
         cls: Class of the model.
         task: What is to be learned.
         arguments: The other constructor arguments.
+
+    Raises:
+        ValueError: An argument is missing, or what the constructor refuses.
     """
     known: dict[str, Any] = {
         "gravity": task.given.get("gravity"),
@@ -164,4 +168,11 @@ def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
         "positions": task.positions,
     }
     asked = inspect.signature(cls.__init__).parameters
-    return cls(**{name: value for name, value in known.items() if name in asked and value is not None} | arguments)
+    used = {name: value for name, value in known.items() if name in asked and value is not None} | arguments
+    missing = [name for name, each in asked.items() if each.kind is each.KEYWORD_ONLY and each.default is each.empty]
+    missing = [name for name in missing if name not in used]
+    if missing:
+        raise ValueError(
+            f"model: expected {', '.join(missing)} of {cls.__name__}, got {', '.join(arguments) or 'none'}"
+        )
+    return cls(**used)

@@ -75,6 +75,7 @@ class Identified(Formulation):
         self.fixed = fixed
         self.contacts, self.radius = start.contacts, getattr(start, "length", 1.0)
         self.scene_type, self.domains, self.clip = kind, learned, clip
+        self.softens = "temperature" in fields
         self.free = nn.ParameterDict(starts)
 
     def numbers(self) -> dict[str, Tensor]:
@@ -86,10 +87,11 @@ class Identified(Formulation):
         return {name: _bound(free[name], domain) for name, domain in self.domains.items()}
 
     def moving(self) -> Scene:
-        numbers: dict[str, Any] = {**self.fixed, **self.numbers()}
-        if self.temperature:
-            numbers["temperature"] = self.temperature
-        scene: Scene = self.scene_type(dt=self.dt, **numbers)
+        return self._scene(self.numbers())
+
+    def _scene(self, learned: Mapping[str, Tensor]) -> Scene:
+        softened = {"temperature": self.temperature} if self.temperature and self.softens else {}
+        scene: Scene = self.scene_type(dt=self.dt, **{**self.fixed, **learned, **softened})
         return scene
 
     def moving_each(self, count: int) -> Scene:
@@ -100,11 +102,14 @@ class Identified(Formulation):
         if free.requires_grad:
             free.register_hook(lambda gradients: clip_rows(gradients, self.clip))
         parts = free.split([self.free[name].numel() for name in self.domains], dim=-1)
-        numbers = self.bound(
-            {name: part.reshape(count, *self.free[name].shape) for name, part in zip(self.domains, parts, strict=True)}
+        return self._scene(
+            self.bound(
+                {
+                    name: part.reshape(count, *self.free[name].shape)
+                    for name, part in zip(self.domains, parts, strict=True)
+                }
+            )
         )
-        scene: Scene = self.scene_type(dt=self.dt, **{**self.fixed, **numbers})
-        return scene
 
     def advance(self, state: Float[Tensor, "*batch nq_plus_nv"], drive: Drive) -> Step:
         return self.moving().advance(state, drive)

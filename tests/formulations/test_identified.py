@@ -11,10 +11,11 @@ from torch import Tensor
 from training.helpers import QUIET, short_fit
 
 import lcplearn
-from lcplearn.datasets import Recordings, Task, simulate_sliding_block
+from lcplearn.datasets import Recordings, Task, simulate_sliding_block, windows
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.domains import NOT_NEGATIVE, Domain
-from lcplearn.formulations import MLP, Formulation, Identified, Physical, build
+from lcplearn.formulations import MLP, Formulation, Identified, Physical, build, loss_terms
+from lcplearn.formulations.cube_corners import CubeCorners
 from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
 from lcplearn.scenes.scene import Mode, Moving
 from lcplearn.scenes.space import Space
@@ -173,3 +174,37 @@ def test_models_without_structure_see_positions_where_motion_depends_on_them() -
     table = simulate_sliding_block(trajectories=1, length=2, long_length=2)
     assert [build(MLP, task).inputs for task in (spring, table)] == [3, 2]
     assert build(MLP, spring, positions=False).inputs == 2
+
+
+def test_a_model_and_data_that_lack_a_number_are_named() -> None:
+    task = simulate_sliding_block(trajectories=1, length=2, long_length=2)
+    with pytest.raises(ValueError, match=r"^model: expected learn of Identified, got scene"):
+        build(Identified, task, scene=SlidingBlock)
+    with pytest.raises(ValueError, match=r"^given: expected the half_width of a cube, got gravity"):
+        build(CubeCorners, task, learn={"mu": 0.1})
+
+
+def test_a_threshold_is_softened_where_the_scene_has_one_and_left_alone_elsewhere() -> None:
+    """Also with gradients clipped, for which each window has numbers of its own."""
+    task = simulate_spring_block(trajectories=1, length=4, long_length=2)
+    spring = build(Identified, task, scene=SpringBlock, learn={"mu": 0.05, "stiffness": 10.0})
+    block = Identified(scene=SlidingBlock, dt=0.05, learn={"mu": 5.0}, given={"mass": 1.0}, clip=10.0)
+    found = windows(task.train, 2)
+    for model, softer in ((spring, False), (block, True)):
+        exact = model.rollout_error(found)
+        with model.softened(1.0):
+            assert torch.equal(model.rollout_error(found), exact) != softer
+
+
+@pytest.mark.parametrize("term", ["prediction", "rollout"])
+def test_the_gradient_of_a_window_is_clipped_whatever_the_loss(term: str) -> None:
+    task = simulate_spring_block(trajectories=1, length=12, long_length=2)
+    found = windows(task.train, 1)
+    states = found.states.clone()
+    states[0, 1] += 1e6  # one window is off by far
+    sizes = []
+    for clip in (None, 1.0):
+        model = build(Identified, task, scene=SpringBlock, learn={"mu": 0.05, "stiffness": 10.0}, clip=clip)
+        loss_terms(model, found._replace(states=states), {term: 1.0})[term].backward()
+        sizes.append(max(float(p.grad.abs()) for p in model.parameters() if p.grad is not None))
+    assert sizes[1] < 1e-3 * sizes[0]
