@@ -67,7 +67,7 @@ def train(config: DictConfig) -> float:
         result = fit(
             model,
             data,
-            horizon=loss.pop("horizon"),
+            horizon=loss.pop("horizon", 1),
             loss=loss,
             stages=settings["stages"],
             epochs=trainer.pop("max_epochs"),

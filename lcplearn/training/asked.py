@@ -9,7 +9,8 @@ import yaml
 
 from lcplearn.datasets import Task
 from lcplearn.formulations import Formulation
-from lcplearn.training.checkpoint import describe
+from lcplearn.formulations.pushing import PushModel
+from lcplearn.training.checkpoint import describe, plain
 from lcplearn.training.module import FormulationModule
 from lcplearn.training.vocabulary import FROM_DATA
 
@@ -46,7 +47,7 @@ def described_data(data: Task, settings: Mapping[str, Any] | None) -> dict[str, 
 
 def write_config(folder: Path, settings: Mapping[str, Any]) -> None:
     """Write config.yaml, which marks the folder as taken: of two runs at once in one folder, the second is refused."""
-    text = yaml.safe_dump(dict(settings), sort_keys=False)
+    text = yaml.safe_dump(plain(settings), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with (folder / "config.yaml").open("x") as file:
@@ -55,14 +56,15 @@ def write_config(folder: Path, settings: Mapping[str, Any]) -> None:
         raise taken(folder) from None
 
 
-def plain(value: Any) -> Any:
+def setting(value: Any) -> Any:
     """A callback, as others that are no settings, by the name of its class."""
     if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
+        return [setting(each) for each in value]
+    value = plain(value)
     return value if value is None or isinstance(value, str | int | float) else type(value).__name__
 
 
-def described_model(model: Formulation) -> dict[str, Any]:
+def described_model(model: Formulation | PushModel) -> dict[str, Any]:
     """A model as a configuration names it."""
     described = describe(model)
     return {"_target_": described["class"], **described["arguments"]}

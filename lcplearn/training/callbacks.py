@@ -58,11 +58,14 @@ class Report(pl.Callback):
 
 
 class EarlyStop(EarlyStopping):
-    """Stop when the validation error no longer improves; where LBFGS is to finish, not before it has begun."""
+    """Stop when the validation error no longer improves; not before the last stage, and LBFGS if it is to finish."""
+
+    def __init__(self, monitor: str, patience: int) -> None:
+        super().__init__(monitor, patience=patience, check_on_train_epoch_end=False)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
-        optimizer = pl_module.optimizer
-        if optimizer.lbfgs_after is None or optimizer.finishes(trainer.current_epoch):
+        optimizer, epoch = pl_module.optimizer, trainer.current_epoch
+        if epoch >= pl_module.stages[-1].first and (optimizer.lbfgs_after is None or optimizer.finishes(epoch)):
             super().on_validation_end(trainer, pl_module)
 
 
@@ -199,7 +202,8 @@ class LastCheckpoint(pl.Callback):
             self.stopped = trainer.strategy.reduce_boolean_decision(self.stopped, all=False)
         done = trainer.current_epoch + 1
         trainer.should_stop = trainer.should_stop or self.stopped
-        if trainer.should_stop or done == trainer.max_epochs or done % self.every == 0:
+        enough = done == trainer.max_epochs or 0 <= trainer.max_steps <= trainer.global_step
+        if trainer.should_stop or enough or done % self.every == 0:
             trainer.save_checkpoint(self.path, weights_only=False)
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:

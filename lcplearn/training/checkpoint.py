@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from lcplearn.formulations import FORMULATIONS, Formulation
@@ -18,20 +19,24 @@ PREFIX = "model."  # of the model's entries in the LightningModule's state
 
 def describe(model: Formulation | PushModel) -> dict[str, Any]:
     """Class and constructor arguments of a model, as plain values."""
-    return {"class": _name(type(model)), "arguments": {k: _plain(value) for k, value in model.arguments.items()}}
+    return {"class": _name(type(model)), "arguments": {k: plain(value) for k, value in model.arguments.items()}}
 
 
 def _name(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value as `weights_only` and YAML read it back: numbers of numpy become Python's, classes their names."""
     if isinstance(value, type):
         return _name(value)
-    if isinstance(value, torch.Tensor):
+    if isinstance(value, torch.Tensor | np.ndarray | np.generic):  # a dt that numpy computed, say
         return value.tolist()
     if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
+        return {name: plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        each = map(plain, value)
+        return list(each) if isinstance(value, list) else tuple(each)
     if isinstance(value, Space):
         return {name: list(each) if isinstance(each, tuple) else each for name, each in vars(value).items()}
     return value

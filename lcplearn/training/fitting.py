@@ -12,9 +12,9 @@ from lightning.pytorch.utilities import rank_zero_only
 from lcplearn.datasets import Task, WindowLoader, Windows, windows
 from lcplearn.formulations import Formulation, loss_terms
 from lcplearn.scenes.space import Space
-from lcplearn.training.asked import described_data, described_model, hyperparameters, plain, taken, write_config
+from lcplearn.training.asked import described_data, described_model, hyperparameters, setting, taken, write_config
 from lcplearn.training.callbacks import BestCheckpoint, Divergence, EarlyStop, LastCheckpoint, Report
-from lcplearn.training.checkpoint import check_resumable, read
+from lcplearn.training.checkpoint import check_resumable, plain, read
 from lcplearn.training.module import FormulationModule
 from lcplearn.training.optimizer import Optimizer
 from lcplearn.training.results import leave
@@ -40,7 +40,8 @@ class Result:
     Attributes:
         model: The model with the parameters that validated best.
         metrics: Figures on the test data, see `metrics.evaluate`; None on processes other than the first.
-        validation: Smallest velocity error on the validation data, over the steps of a window [m/s].
+        validation: Smallest error on the validation data, as `Task.chosen_by` says: of velocities over the steps of a
+            window [m/s], or of poses [m]; NaN where training ended before a validation.
         folder: Folder of the run.
     """
 
@@ -116,7 +117,7 @@ def fit(
         "stages": list(map(dict, stages)), "data": described_data(data, settings),
     }  # fmt: skip
     module = FormulationModule(
-        model, stages=planned, optimizer=optimizer, chosen_by=data.chosen_by, training=flat(used),
+        model, stages=planned, optimizer=optimizer, chosen_by=data.chosen_by, training=flat(plain(used)),
         log_every=every * (len(loader) if batch_size else 1),
     )  # fmt: skip
     best, last = BestCheckpoint(folder, module.monitor, ckpt_path), LastCheckpoint(folder / "last.ckpt", every)
@@ -125,10 +126,10 @@ def fit(
     seconds, resumed = _resumed(ckpt_path, module, epochs, allow_changes=allow_changes)
     if lightning.is_global_zero:
         rest = {"loss": loss, "horizon": horizon, "epochs": epochs, "patience": patience}
-        rest["trainer"] = {key: plain(value) for key, value in (trainer or {}).items()}
+        rest["trainer"] = {key: setting(value) for key, value in (trainer or {}).items()}
         write_config(folder, {**(settings or {"model": described_model(model), **used, **rest}), **resumed})
     seconds += run(lightning, module, loader, validation, folder, ckpt_path)
-    if last.stopped:
+    if last.stopped and lightning.current_epoch < epochs:  # in the last epoch a signal comes too late
         raise TrainingInterrupted(last.path)
     trained, error = _best(module, best)
     if not lightning.is_global_zero:

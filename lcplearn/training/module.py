@@ -66,10 +66,11 @@ class FormulationModule(pl.LightningModule):
         self.started = time.perf_counter()
 
     def on_train_epoch_start(self) -> None:
-        adam, stage = self._optimizers()[0], self.stage
+        optimizers, stage = self._optimizers(), self.stage
         if self.current_epoch == stage.first:
-            adam.state.clear()  # the gradients of another loss have another size
-        for group in adam.param_groups:
+            for optimizer in optimizers:
+                optimizer.state.clear()  # the gradients of another loss have another size
+        for group in optimizers[0].param_groups:
             group["lr"] = stage.learning_rate(self.current_epoch, self.optimizer)
 
     def training_step(self, windows: Windows, index: int) -> dict[str, Tensor]:

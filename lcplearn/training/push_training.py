@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm import tqdm
 
 from lcplearn.datasets.pushes import PushData
 from lcplearn.formulations.pushing import PushModel, PushPrediction
+from lcplearn.training.asked import described_model, write_config
 from lcplearn.training.checkpoint import describe
 from lcplearn.training.push_figures import draw
 from lcplearn.training.push_metrics import by_configuration, errors, format_score, intervals
@@ -58,10 +58,7 @@ def fit_pushes(
         ValueError: the folder holds a run already.
     """
     folder = Path(folder)
-    if (folder / "config.yaml").exists():
-        raise ValueError(f"{folder} holds a run already: choose another folder, nothing is overwritten.")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(yaml.safe_dump(dict(settings or describe(model)), sort_keys=False))
+    write_config(folder, settings or {"model": described_model(model)})
     with tqdm(total=len(data.splits) + 1, desc="cross-validation", unit="fit", disable=not progress) as bar:
         start = time.perf_counter()
         judged, prediction = _cross_validate(model, data, bar)

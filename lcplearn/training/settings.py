@@ -41,10 +41,18 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
     for key in settings:
         if key not in vocabulary(conf, "")[0]:
             raise SettingsError(unknown(key, conf))
-    for key in ("seed", "threads"):
-        _check_type(key, settings.get(key), "int")
-    for key in ("batch_size", "batches", "patience"):
-        _check_type(key, settings.get(key), "int | None")
+    for group in ("data", "model", "loss", "optimizer", "trainer"):
+        if not settings.get(group):
+            raise SettingsError(f"{group}: expected the name of a file in conf/{group}/, got {settings.get(group)}")
+    for kind, keys in {
+        "int": ("seed", "threads"),
+        "int | None": ("batch_size", "batches", "patience"),
+        "bool": ("allow_changes",),
+    }.items():
+        for key in keys:
+            _check_type(key, settings.get(key), kind)
+    if not isinstance(settings.get("stages"), list):
+        raise SettingsError(f"stages: expected a list, [] for none, got {settings.get('stages')!r}")
     if settings["threads"] < 1:
         raise SettingsError(f"threads: expected at least 1, got {settings['threads']}")
     if settings["patience"] is not None and settings["patience"] < 1:
@@ -54,19 +62,20 @@ def check(settings: Mapping[str, Any], conf: Path, *, multirun: bool = False, pr
     _check_friction(settings)
     _check_pushes(settings, conf)
     for group in ("data", "model", "optimizer", "logger"):
-        if settings[group] or group != "logger":  # logger=none is empty
+        if settings.get(group) or group != "logger":  # logger=none is empty
             _check_target(group, settings[group])
     if settings["batch_size"] is not None and settings["optimizer"].get("lbfgs_after") is not None:
         raise SettingsError("LBFGS needs the full batch: set batch_size=null, or optimizer=adam.")
     _check_ranges(settings)
+    _check_learn(settings["model"].get("learn", {}))
     own = not str(settings["model"].get("_target_")).startswith("lcplearn.")  # and may have loss terms of its own
     _check_loss(settings["loss"], settings["loss"] if own else vocabulary(conf, "loss")[0])
     length, horizon = settings["data"].get("length"), settings["loss"].get("horizon", 1)
     if length is not None and horizon > length:
         raise SettingsError(f"loss.horizon: expected at most data.length={length}, got {horizon}")
     _check_arguments("trainer", settings["trainer"], TRAINER)
-    for key in ("max_epochs", "check_val_every_n_epoch"):
-        epochs = settings["trainer"].get(key, 1)
+    for key, default in (("max_epochs", None), ("check_val_every_n_epoch", 1)):
+        epochs = settings["trainer"].get(key, default)
         if epochs is None or epochs < 1:
             raise SettingsError(f"trainer.{key}: expected at least 1, got {epochs}")
     if settings["trainer"].get("precision", "64-true") not in ("64-true", "64", 64):
@@ -126,6 +135,16 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
                 raise SettingsError(f"{group}.{key}: expected at least 0, got {value}")
 
 
+def _check_learn(learn: Any) -> None:
+    """Starts of a scene's numbers, by name: numbers, or lists of them."""
+    if not isinstance(learn, Mapping):
+        raise SettingsError(f"model.learn: expected names and their starts, got {learn!r}")
+    for name, start in learn.items():
+        rows = start if isinstance(start, list) else [start]
+        for number in (each for row in rows for each in (row if isinstance(row, list) else [row])):
+            _check_type(f"model.learn.{name}", number, "float")
+
+
 def _check_friction(settings: Mapping[str, Any]) -> None:
     """Models of known friction learn from labels that only simulations have."""
     model = str(settings["model"].get("_target_")).rpartition(".")[2]
@@ -153,12 +172,14 @@ def _check_pushes(settings: Mapping[str, Any], conf: Path) -> None:
         raise SettingsError(f"{asked}: experiment=pushes_supports, pushes_residual, pushes_ridge, ...")
     if not pushes:
         return
-    for group, choice in (("loss", "prediction"), ("optimizer", "adam_lbfgs")):
+    for group, choice in (("loss", "prediction"), ("optimizer", "adam_lbfgs"), ("trainer", "cpu")):
         content = yaml.safe_load((conf / group / f"{choice}.yaml").read_text())
-        if any(settings[group].get(key) != value for key, value in content.items() if key != "defaults"):
+        read = {"defaults", "enable_progress_bar"}  # the last of the trainer is heeded
+        if any(settings[group].get(key) != value for key, value in content.items() if key not in read):
             raise SettingsError(f"{group} can't be chosen with data=pushes: these models fit themselves.")
-    for key in ("batch_size", "batches", "ckpt_path"):
-        if settings.get(key) is not None:
+    top = yaml.safe_load((conf / "train.yaml").read_text())
+    for key in ("batch_size", "batches", "patience", "stages", "ckpt_path"):
+        if settings.get(key) != top[key]:
             raise SettingsError(f"{key} can't be set with data=pushes: a fit takes seconds and is done as a whole.")
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from lcplearn.domains import positive
 from lcplearn.training.optimizer import Optimizer
 
 
@@ -27,7 +28,9 @@ class Stage:
 
     def learning_rate(self, epoch: int, optimizer: Optimizer) -> float:
         """Adam's learning rate in an epoch of the stage."""
-        return replace(optimizer, lr=self.lr).learning_rate(epoch - self.first, self.epochs)
+        after = optimizer.lbfgs_after
+        own = replace(optimizer, lr=self.lr, lbfgs_after=None if after is None else max(after - self.first, 0))
+        return own.learning_rate(epoch - self.first, self.epochs)
 
 
 def plan(
@@ -43,19 +46,23 @@ def plan(
         lr: Learning rate of the last stage.
 
     Raises:
-        ValueError: No epoch, a stage lacks its epochs or leaves none to the last stage, or its horizon is out of range.
+        ValueError: No epoch, a stage lacks its epochs or leaves none to the last stage, its horizon is out of range, or
+            its learning rate is no positive number.
     """
     if epochs < 1:
         raise ValueError(f"epochs: expected at least 1, got {epochs}")
+    if not isinstance(before, Sequence) or not all(isinstance(stage, Mapping) for stage in before):
+        raise ValueError(f"stages: expected a list of {{epochs: .., what differs}}, got {before!r}")
     stages: list[Stage] = []
     first = 0
-    for number, given in enumerate((*before, {"epochs": epochs - sum(stage.get("epochs", 0) for stage in before)}), 1):
-        what = {"lr": lr, "horizon": horizon} | dict(given)
-        stage = Stage(what.pop("epochs", 0), {}, what.pop("horizon"), what.pop("lr"), first)
-        if stage.epochs < 1:
-            raise ValueError(f"stages: expected at least 1 epoch in stage {number}, got {stage.epochs}")
-        if not 1 <= stage.horizon <= horizon:
-            raise ValueError(f"stages: expected a horizon from 1 to {horizon} in stage {number}, got {stage.horizon}")
+    for number, given in enumerate((*before, {}), 1):
+        what = {"lr": lr, "horizon": horizon, "epochs": epochs - first if number > len(before) else 0} | dict(given)
+        stage = Stage(what.pop("epochs"), {}, what.pop("horizon"), what.pop("lr"), first)
+        if not (isinstance(stage.epochs, int) and stage.epochs >= 1):
+            raise ValueError(f"stages: expected at least 1 epoch in stage {number}, got {stage.epochs!r}")
+        if not (isinstance(stage.horizon, int) and 1 <= stage.horizon <= horizon):
+            raise ValueError(f"stages: expected a horizon from 1 to {horizon} in stage {number}, got {stage.horizon!r}")
+        positive(f"stages: lr of stage {number}", stage.lr)
         stages.append(replace(stage, loss=dict(loss) | what))
         first += stage.epochs
     return tuple(stages)

@@ -1,5 +1,6 @@
 """fit(): what it leaves, that it reproduces itself, and that it can be resumed."""
 
+import dataclasses
 import json
 import logging
 import signal
@@ -7,6 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -133,6 +135,58 @@ def test_a_training_stopped_by_a_signal_says_how_to_resume_and_loses_nothing(tmp
     short_fit(Structured(dt=data.dt), data, tmp_path / "resumed", ckpt_path=stopped.value.checkpoint)
     short_fit(Structured(dt=data.dt), data, tmp_path / "whole")
     assert torch.equal(final_state(tmp_path / "resumed"), final_state(tmp_path / "whole"))
+
+
+def test_a_signal_in_the_last_epoch_comes_too_late(tmp_path: Path) -> None:
+    data = tiny_data()
+    trainer = QUIET | {"callbacks": [Terminate()]}
+    result = short_fit(Structured(dt=data.dt), data, tmp_path / "run", epochs=1, trainer=trainer)
+    assert result.metrics is not None
+
+
+def last_epoch(folder: Path) -> int:
+    return int(torch.load(folder / "last.ckpt")["epoch"])
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_early_stopping_waits_for_lbfgs_and_for_the_last_stage(every: int, tmp_path: Path) -> None:
+    """With a rate of 1e-300 nothing improves."""
+    data, idle = tiny_data(), {"lr": 1e-300, "lbfgs_iterations": 1}
+    more: dict[str, Any] = {"epochs": 12, "patience": 1, "trainer": QUIET | {"check_val_every_n_epoch": every}}
+    lbfgs = Optimizer(lbfgs_after=8, **idle)
+    short_fit(Physical(dt=data.dt), data, tmp_path / "lbfgs", optimizer=lbfgs, **more)
+    assert last_epoch(tmp_path / "lbfgs") >= 8
+    short_fit(Physical(dt=data.dt), data, tmp_path / "s", optimizer=Optimizer(**idle), stages=[{"epochs": 7}], **more)
+    assert 7 <= last_epoch(tmp_path / "s") < 11  # and stops then
+
+
+def test_no_optimizer_remembers_the_loss_of_the_stage_before(tmp_path: Path) -> None:
+    data, seen = tiny_data(), []
+
+    class Look(Callback):
+        def on_train_batch_start(self, trainer: Any, *arguments: Any) -> None:
+            seen.append([len(optimizer.state) for optimizer in trainer.optimizers])
+
+    trainer = QUIET | {"callbacks": [Look()]}
+    stages = [{"epochs": 2, "prediction": 0.0, "rollout": 1.0}]
+    short_fit(Physical(dt=data.dt), data, tmp_path, optimizer=Optimizer(lbfgs_after=1), stages=stages, trainer=trainer)
+    assert seen[1][0] > 0
+    assert seen[2] == [0, 0]
+
+
+def test_a_training_that_ends_by_its_number_of_steps_leaves_its_last_checkpoint(tmp_path: Path) -> None:
+    data, few = tiny_data(), QUIET | {"max_steps": 2, "check_val_every_n_epoch": 10}
+    result = short_fit(Physical(dt=data.dt), data, tmp_path, epochs=20, trainer=few, optimizer=Optimizer())
+    assert load(tmp_path / "last.ckpt").physical_parameters() == result.model.physical_parameters()
+
+
+def test_numbers_that_numpy_computed_come_back_from_checkpoints_and_settings(tmp_path: Path) -> None:
+    data = tiny_data()
+    data = dataclasses.replace(data, dt=np.float64(data.dt))
+    model = Physical(dt=data.dt, gravity=np.float64(9.81))
+    short_fit(model, data, tmp_path, epochs=1, optimizer=Optimizer(lr=np.float64(0.1)))
+    assert load(tmp_path / "best.ckpt").dt == data.dt
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["lr"] == 0.1
 
 
 def test_the_best_model_before_an_interruption_stays_the_best_after_it(tmp_path: Path) -> None:

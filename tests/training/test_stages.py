@@ -1,5 +1,7 @@
 """Stages of a training."""
 
+from typing import Any
+
 import pytest
 
 from lcplearn.training.optimizer import Optimizer
@@ -25,10 +27,25 @@ def test_the_rate_starts_anew_and_decays_within_a_stage():
     assert rates == sorted(rates, reverse=True)
 
 
+def test_the_rate_of_a_stage_in_which_lbfgs_takes_over_ends_at_zero_there():
+    last = plan([{"epochs": 50}], **LAST | {"epochs": 200})[-1]
+    rates = [last.learning_rate(epoch, Optimizer(lbfgs_after=150)) for epoch in (50, 100, 150)]
+    assert rates == pytest.approx([0.03, 0.015, 0.0])
+
+
 @pytest.mark.parametrize(
     ("before", "message"),
-    [([{"epochs": 10}], "stage 2"), ([{"horizon": 8}], "stage 1"), ([{"epochs": 1, "horizon": 64}], "from 1 to 32")],
+    [
+        ([{"epochs": 10}], "stage 2"),
+        ([{"horizon": 8}], "stage 1"),
+        ([{"epochs": 1, "horizon": 64}], "from 1 to 32"),
+        ([{"epochs": 1}, {"epochs": 1.5}], "at least 1 epoch in stage 2, got 1.5"),
+        ([{"epochs": "1"}], "at least 1 epoch in stage 1, got '1'"),
+        ([{"epochs": 1, "lr": -1}], "lr of stage 1: expected a positive number, got -1"),
+        ([5], r"^stages: expected a list of .* got \[5\]"),
+        (5, r"^stages: expected a list of .* got 5"),
+    ],
 )
-def test_stages_that_make_no_sense(before: list[dict[str, int]], message: str):
+def test_stages_that_make_no_sense(before: Any, message: str):
     with pytest.raises(ValueError, match=message):
         plan(before, **LAST)
