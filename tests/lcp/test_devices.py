@@ -111,6 +111,7 @@ def test_answers_do_not_depend_on_how_often_the_device_is_asked(family, smoothin
 
 
 @newer_torch
+@pytest.mark.slow
 def test_the_path_compiles_as_one_graph_with_the_same_answers():
     """In a process of its own: checks of shapes, on in tests only, can't be traced."""
     torch.multiprocessing.spawn(compile_path)

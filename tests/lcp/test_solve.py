@@ -37,7 +37,7 @@ def arbitrary_problems(draw):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None)
 @given(problem=semidefinite_problems())
 def test_semidefinite_problem_is_solved_exactly_when_enumeration_finds_a_solution(method, problem):
     M, q = problem
@@ -48,7 +48,7 @@ def test_semidefinite_problem_is_solved_exactly_when_enumeration_finds_a_solutio
 
 
 @pytest.mark.parametrize("method", METHODS)
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None)
 @given(problem=arbitrary_problems())
 def test_status_is_true_for_any_matrix(method, problem):
     M, q = problem

@@ -68,7 +68,7 @@ class Study:
         self.path = self.folder / "results.csv"
         self._settings = f"{name} quick={options.quick} seed={options.seed} threads={options.threads}"
         self._sections: list[dict[str, object]] = []
-        self._figures: list[tuple[str, Figure]] = []
+        self._figures: list[str] = []
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
             self._check_settings()
@@ -128,12 +128,13 @@ class Study:
             name = re.sub(r"[^a-z0-9]+", "_", heading.lower()).strip("_")
             section["figure"] = f"{name}.png"
             figure.savefig(self.folder / f"{name}.png", dpi=150)
-            self._figures.append((name, figure))
+            self._figures.append(name)
             print(f"\n{self.folder / name}.png")
         self._sections.append(section)
 
     def finish(self) -> None:
         """Write summary.json and the TensorBoard run; say what to look at."""
+        from matplotlib.image import imread
         from torch.utils.tensorboard import SummaryWriter
 
         summary = {"name": self.name, "settings": self._settings, "sections": self._sections}
@@ -141,8 +142,8 @@ class Study:
         for old in self.folder.glob("events.out.tfevents.*"):
             old.unlink()
         with SummaryWriter(str(self.folder)) as writer:
-            for name, figure in self._figures:
-                writer.add_figure(f"{self.name}/{name}", figure, close=False)
+            for name in self._figures:
+                writer.add_image(f"{self.name}/{name}", imread(self.folder / f"{name}.png"), dataformats="HWC")
             for section in self._sections:
                 writer.add_text(f"{self.name}/{section['heading']}", str(section["text"]) or "-")
         print("\nWhat to look at first:")

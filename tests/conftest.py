@@ -1,0 +1,18 @@
+"""What the quick suite (-m "not slow") leaves to the whole one: shapes checked at each call, and many examples."""
+
+import pytest
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+# But for lcp/solve.py and lcp/layer.py, which check their arguments themselves.
+CHECKED = [f"lcplearn.lcp.{name}" for name in ("residuals", "interior_point", "gradient", "methods", "solution")]
+CHECKED += ["lcplearn.scenes", "lcplearn.formulations", "lcplearn.datasets"]
+
+settings.register_profile("quick", max_examples=20)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.option.markexpr == "not slow":
+        settings.load_profile("quick")
+    else:
+        install_import_hook(CHECKED, "beartype.beartype")  # it makes the tests take twice as long
