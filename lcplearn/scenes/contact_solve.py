@@ -9,12 +9,12 @@ from torch import Tensor
 from lcplearn.scenes.contact_gradient import attach_gradient
 from lcplearn.scenes.friction_lcp import (
     CRUDE,
+    DEAD_SLIP,
     DEAD_ZONE,
     FULL_RANK,
+    LAST_RESORT,
     MAX_ITERATIONS,
-    PATIENCE,
     PLAIN,
-    PROXIMAL,
     ROUNDING,
     SETTLED,
     STAYS,
@@ -24,7 +24,9 @@ from lcplearn.scenes.friction_lcp import (
     frictionless_lcp,
     law_violation,
     polygon_lcp,
+    regularisation,
 )
+from lcplearn.scenes.numbers import matvec
 
 
 def solve(problem: Problem, polygon: int | None, rest: bool) -> tuple[Answer, Tensor]:
@@ -87,14 +89,15 @@ def _iterate(part: Problem) -> Answer:
     result, todo = guess.clone(), torch.arange(len(part.free), device=part.free.device)
     old, was_damped = torch.full_like(part.free[:, 0], torch.inf), torch.zeros_like(guess.solved)
     for iteration in range(MAX_ITERATIONS):
-        soft = PROXIMAL * part.mobility() if iteration >= PLAIN else torch.zeros_like(part.target)
+        proximal, creep = regularisation(iteration)
+        soft = proximal * part.mobility()
         softer = part._replace(compliance=part.compliance + soft, target=part.target + soft * guess.normal)
-        new = cone_lcp(softer, guess)
+        new = cone_lcp(softer, guess, creep)
         change = part.mass_norm(new.velocity - guess.velocity)
         away = soft * (new.normal - guess.normal).abs() / part.speed_scale().clamp_min(1e-300)
         wrong = torch.maximum(law_violation(part, new), away.amax(-1))
         stays = change <= STAYS * (part.mass_norm(part.free) + part.mass_norm(new.velocity))
-        enough = stays & (wrong <= CRUDE) & (iteration >= PATIENCE)
+        enough = stays & (wrong <= CRUDE) & (iteration >= LAST_RESORT)
         new = new._replace(settled=(wrong <= SETTLED) | enough)
         result.put(todo, None, new)
         going = torch.nonzero(~(new.settled & new.solved))[:, 0]
@@ -131,7 +134,8 @@ def _at_rest(problem: Problem, found: Answer) -> Tensor:
     normal_speed = (problem.normal @ found.velocity.unsqueeze(-1)).squeeze(-1)
     limit = DEAD_ZONE * problem.speed_scale() + problem.compliance * found.normal.sum(-1, keepdim=True)
     touches = (normal_speed.abs() <= limit) & (problem.excess(found.velocity) <= limit)
-    holds = touches & (found.normal > 0.0) & found.sticks
+    slip = torch.linalg.vector_norm(matvec(problem.tangents, found.velocity.unsqueeze(-2)), dim=-1)
+    holds = touches & (found.normal > 0.0) & (found.sticks | (slip <= DEAD_SLIP * problem.speed_scale()))
     result = found.solved & found.settled & (touches.sum(-1) + directions * holds.sum(-1) >= nv)
     elements = torch.nonzero(result)[:, 0]
     if directions == 0 or not len(elements):

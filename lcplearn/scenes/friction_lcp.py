@@ -4,7 +4,7 @@
 
     |f_t| <= mu lambda,     f_s = -weight v_s,     weight = mu lambda / |slip|,
 
-with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is below `CREEPS`, t is
+with slip and load of the iterate before. Where the iterate's facet sticks, or its slip is below 10 `CREEP`, t is
 along the friction force, and the slip in the weight is at least `CREEP`. At the fixed point v_s = 0 (slip) or f_s = 0
 (stick), so that this is Coulomb's law, and its derivative: what changes the weight multiplies v_s = 0.
 
@@ -17,13 +17,14 @@ f_s is condensed out of the Delassus matrix A = J mass^-1 J', and the facets mak
 so that v_t = w_a - sigma is read from complementary variables, and is 0 to the last bit at stick.
 
 Where contacts are redundant the loads that solve an LCP are many, and from one iterate to the next another contact
-carries them. An iteration that has not settled after `PLAIN` LCPs goes on with a proximal term: the compliance grows
-by p = `PROXIMAL` / (n mass^-1 n'), the target by p times the load of the iterate before. What it settles at solves the
-same law.
+carries them. An iteration that has not settled after `PLAIN` LCPs goes on with a proximal term (`regularisation`): the
+compliance grows by a share p of n mass^-1 n', the target by as much times the load of the iterate before. What it
+settles at solves the same law. A small share keeps loads together, a large one ends cycles, and slows what converges.
 
 Corners of a body that comes to rest may contradict each other: none may slip, yet each moves up or down at its own
 speed of 1e-6 and less, and turns the body by it. Then they creep, as a slip of `CREEP` stands for none, and friction
-grows from LCP to LCP. After `PATIENCE` of them a velocity that stays counts as settled if the law holds to `CRUDE`.
+grows from LCP to LCP. From `PLAIN` to `PATIENCE` LCPs a slip of `FINE_CREEP` stands for none; it has fewer right
+digits. After `LAST_RESORT` a velocity that stays counts as settled if the law holds to `CRUDE`.
 
 Source: NOTES 5.7; the rows of a polygon: Stewart and Trinkle 1996.
 """
@@ -37,18 +38,20 @@ from torch import Tensor
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.numbers import matvec
 
-MAX_ITERATIONS = 60  # of the cone's fixed point; the mean is about 2.5
+MAX_ITERATIONS = 130  # of the cone's fixed point; the mean is about 2.5
 PLAIN = 12  # of them before the proximal term
-PROXIMAL = 0.1
+PATIENCE = 40  # of them before the proximal term grows, and grows again at the last resort
+LAST_RESORT = 70
 SETTLED = 3e-14  # violation of the law as a speed, relative to that of free flight and to what the load can cause
 DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
+DEAD_SLIP = 1e-10  # slip of one, likewise
 FULL_RANK = 1e-6  # smallest eigenvalue of the rows that hold a body at rest, relative to their largest diagonal
 ROUNDING = 1e-13  # of speeds, relative to those of free flight
 CREEP = 1e-8  # speed that stands for the slip at stick, likewise
+FINE_CREEP = 1e-11
 CREEPS = 10.0 * CREEP  # a slip as small as what a weight leaves over; it has no direction worth following
-PATIENCE = 45
 STAYS = 1e-10  # change of velocity from one iterate to the next, relative in the mass norm
-CRUDE = 1e-6  # violation of the law, likewise
+CRUDE = 1e-8  # violation of the law, likewise
 
 
 class Problem(NamedTuple):
@@ -88,8 +91,10 @@ class Problem(NamedTuple):
         return (self.mass * velocity.square()).sum(-1).sqrt()
 
     def speed_scale(self) -> Tensor:
-        """Largest normal speed [B, C] that a velocity with the energy of the free velocity can have."""
-        return self.mobility().sqrt() * self.mass_norm(self.free)[:, None]
+        """Largest normal speed [B, C] of a velocity with the energy of the free one and what the targets demand."""
+        unit = self.mobility().sqrt()
+        demanded = (self.target.relu() / unit.clamp_min(1e-300)).amax(-1)
+        return unit * (self.mass_norm(self.free) + demanded)[:, None]
 
 
 class Answer(NamedTuple):
@@ -145,6 +150,15 @@ class Answer(NamedTuple):
         return new._replace(**{k: mix(getattr(self, k), getattr(new, k)) for k in ("velocity", "normal", "friction")})
 
 
+def regularisation(iteration: int) -> tuple[float, float]:
+    """The proximal term p n mass^-1 n' and the slip that stands for none in an iteration."""
+    if iteration < PLAIN:
+        return 0.0, CREEP
+    if iteration < PATIENCE:
+        return 1e-3, FINE_CREEP
+    return 0.1 if iteration < LAST_RESORT else 1.0, CREEP
+
+
 def frictionless_lcp(problem: Problem) -> Answer:
     """One row a contact."""
     A, speed, response = _delassus(problem, problem.normal)
@@ -155,14 +169,14 @@ def frictionless_lcp(problem: Problem) -> Answer:
     return Answer(velocity, solution.z, none, none, solution.z < 0.0, solution.solved, solution.solved)
 
 
-def cone_lcp(problem: Problem, guide: Answer | None) -> Answer:
+def cone_lcp(problem: Problem, guide: Answer | None, creep: float = CREEP) -> Answer:
     """Three rows a contact; with two friction directions their facets and weights are those of the guide."""
     K, mu = problem.mu.shape[-1], problem.mu
     eye = torch.eye(K, dtype=mu.dtype, device=mu.device)
     if problem.directions == 1:
         axes = torch.ones_like(problem.tangents[..., :1, :1])
     else:
-        axes, weight = _facets(problem, guide)
+        axes, weight = _facets(problem, guide, creep)
     along = axes @ problem.tangents  # t, or t and s
     A, speed, response = _delassus(problem, torch.cat((problem.normal, *along.unbind(-2)), dim=-2))
     if problem.directions == 2:
@@ -243,19 +257,19 @@ def polygon_lcp(problem: Problem, k: int) -> Answer:
     return Answer(velocity, z[:, :K], friction, slip, z[:, size:] == 0.0, solution.solved, solution.solved)
 
 
-def _facets(problem: Problem, guide: Answer | None) -> tuple[Tensor, Tensor]:
+def _facets(problem: Problem, guide: Answer | None, creep: float) -> tuple[Tensor, Tensor]:
     """Axes t, s [B, K, 2, 2] and the weight across [B, K], from the iterate before; constants for the gradient."""
     if guide is None:
         raise ValueError("guide: expected an iterate, got None")
     with torch.no_grad():
         slip = torch.linalg.vector_norm(guide.slip, dim=-1)
         scale = problem.speed_scale()
-        sticks = guide.sticks | (slip <= CREEPS * scale)
+        sticks = guide.sticks | (slip <= 10.0 * creep * scale)
         direction = torch.where(sticks.unsqueeze(-1), -guide.friction, guide.slip)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         some = length > 0.0
         t = torch.where(some, direction / torch.where(some, length, 1.0), direction.new_tensor([1.0, 0.0]))
-        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), CREEP * scale)
+        speed = torch.maximum(torch.where(guide.sticks, 0.0, slip), creep * scale)
         s = torch.stack((-t[..., 1], t[..., 0]), dim=-1)
         weight = torch.where(speed > 0.0, problem.mu * guide.normal / torch.where(speed > 0.0, speed, 1.0), 0.0)
         return torch.stack((t, s), dim=-2), weight

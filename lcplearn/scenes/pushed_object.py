@@ -69,7 +69,7 @@ class PushedObject:
 
     Gradient: of poses and forces with respect to all tensors of `Grip` and `Push`. Only the last LCP of each step is
     differentiated; at the fixed point that is the gradient of the cone's solution. The edge that is touched and
-    whether a support is lifted are constants.
+    whether a support is lifted are constants. What is not solved has the gradient zero.
 
     Status: `PushPath.solved` and `settled`, for each step.
 

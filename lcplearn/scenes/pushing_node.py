@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, refuse_batched
 from lcplearn.scenes.pushing_kernel import (
     AWAY,
     SLIDES,
@@ -30,7 +30,11 @@ def _adjoint_element(
     finger, x, memory, y, twist_grad, force_grad, points_grad, loads_grad, transfer_grad, wrench_grad, point_grad,
     normal_grad, tangent_grad, numbers_grad,
 ):  # fmt: skip
-    """Gradients from those with respect to twist and force: y'(right side - A x) at the equations that x solves."""
+    """Gradients from those with respect to twist and force: y'(right side - A x) at the equations that x solves.
+
+    They stay 0, as those of what is not solved, where no pivot is left in A transposed: rounding decides it, as A had
+    them all when it gave x.
+    """
     along, across, weight, limit, passed, arms, steps, A, _, lifted = memory
     place(point, normal, tangent, normal_step, tangent_step, arms, steps)
     linearise(points, loads, transfer, slip, load, creep, along, across, weight, limit, passed, lifted)
@@ -145,6 +149,7 @@ class _Settle(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, twist_grad: Tensor, force_grad: Tensor, *_: Any) -> Any:
+        refuse_batched((twist_grad, force_grad))
         arrays, (state, flags) = tuple(as_array(x) for x in ctx.saved_tensors), ctx.kept
         grads = tuple(np.zeros_like(x) for x in arrays)
         _adjoint(*arrays, ctx.creep, state, flags, (as_array(twist_grad), as_array(force_grad)), grads)

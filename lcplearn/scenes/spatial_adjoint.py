@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
-from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, refuse_batched
 from lcplearn.scenes.spatial_kernel import SMALL, Options, Rolled, approach, roll, rotation
 
 
@@ -123,99 +123,142 @@ def _corner_back(c, R, rows_, gap_, radius, c_, R_, numbers_, x_):
     x_[2] += gap_
 
 
+@compiled
+def _approach_memory(C):
+    """Free velocity, rows, gaps and closing speeds of C corners."""
+    return np.empty(6), np.empty((C, 6)), np.empty((C, 2, 6)), np.empty(C), np.empty(C)
+
+
+@compiled
+def _loaded_memory(C):
+    """Of the loaded contacts: rows, impulses, stick, mu, compliance, share of an impact, their numbers."""
+    return (
+        np.empty((3 * C, 6)), np.empty(3 * C), np.empty(C, np.bool_), np.empty(C), np.empty(C), np.empty(C),
+        np.empty(C, np.int64),
+    )  # fmt: skip
+
+
+@compiled
+def _loaded_gradients(C):
+    """With respect to rows, target, mu and compliance; and zeros, for the impulses, which are no result."""
+    return np.empty((3 * C, 6)), np.empty(C), np.empty(C), np.empty(C), np.zeros(3 * C)
+
+
+@compiled
+def _gather(load, friction, sticking, approached, numbers, impact_speed, loaded):
+    """The contacts that are loaded, one after the other: their number."""
+    _, normal, tangents, _, closing = approached
+    rows, y, sticks, mu, soft, share, index = loaded
+    K = 0
+    for i in range(load.size):
+        if load[i] > 0.0:
+            index[K], sticks[K], soft[K] = i, sticking[i], numbers[5]
+            share[K] = min(closing[i] / impact_speed, 1.0)
+            mu[K] = numbers[2] + (numbers[3] - numbers[2]) * share[K]
+            rows[3 * K], y[3 * K] = normal[i], load[i]
+            for d in range(2):
+                rows[3 * K + 1 + d], y[3 * K + 1 + d] = tangents[i, d], friction[i, d]
+            K += 1
+    return K
+
+
+@compiled
+def _contact_back(
+    i, dt, newton, impact_speed, x, R, corners, numbers, approached, loaded, gradients, corners_, R_, numbers_, x_
+):  # fmt: skip
+    """Backwards through target and friction of the loaded contact i, to its corner and to the numbers."""
+    _, normal, _, gap, closing = approached
+    share, j = loaded[5][i], loaded[6][i]
+    rows_, target_, mu_, soft_, _ = gradients
+    bounce_, gap_, closing_ = target_[i], -target_[i] / dt, 0.0
+    if newton:
+        bounce = numbers[1] * closing[j]
+        if bounce > 0.0 and bounce + gap[j] / dt > 0.0:
+            gap_ += target_[i] / dt
+        else:
+            bounce_ = 0.0
+    numbers_[1] += bounce_ * closing[j]
+    closing_ += bounce_ * numbers[1]
+    numbers_[2] += mu_[i] * (1.0 - share)
+    numbers_[3] += mu_[i] * share
+    if share < 1.0:
+        closing_ += mu_[i] * (numbers[3] - numbers[2]) / impact_speed
+    numbers_[5] += soft_[i]
+    if closing[j] > 0.0:  # closing = -n x' and, by the continuous law, less gap / dt
+        for k in range(6):
+            rows_[3 * i, k] -= closing_ * x[7 + k]
+            x_[7 + k] -= closing_ * normal[j, k]
+        if not newton and gap[j] > 0.0:
+            gap_ -= closing_ / dt
+    _corner_back(corners[j], R, rows_[3 * i : 3 * i + 3], gap_, numbers[0], corners_[j], R_, numbers_, x_)
+
+
+@compiled
+def _free_back(x, free, gyroscopic, mass, dt, force, free_, x_, force_, mass_, gravity_):
+    """Backwards through the velocity after a step without contacts; adds to x_[7:], mass_ and gravity_."""
+    for k in range(6):
+        force_[k] = dt * free_[k] / mass[k]
+        mass_[k] -= dt * force[k] * free_[k] / mass[k] ** 2
+    for k in range(3):
+        gravity_[k] += dt * free_[k]
+        x_[7 + k] += free_[k]
+    if gyroscopic:
+        before = (x_[10], x_[11], x_[12])
+        _spin_back(x[10:13], free[3:], mass[3:], dt, force[3:], free_, x_, mass_[3:])
+        for k in range(3):
+            x_[10 + k] += before[k]
+    else:
+        for k in range(3, 6):
+            x_[7 + k] += free_[k]
+
+
 def _make_roll_back(sources: str) -> Any:
     def _roll_back(
         dt, newton, gyroscopic, rest, impact_speed, force, corners, mass, numbers, gravity, states, modes, solved,
         loads, frictions, sticking, states_, force_, corners_, mass_, numbers_, gravity_,
     ):  # fmt: skip
-        """Gradients from that of the states; that of the start replaces states_[:, 0]."""
+        """Gradients from that of the states; that of the start replaces states_[:, 0].
+
+        Nothing goes back through a step that is not solved, whose numbers need not be finite.
+        """
         sources  # noqa: B018, for the cache
         B, T, C = len(states), force.shape[1], corners.shape[1]
-        normal, tangents, gap, closing = np.empty((C, 6)), np.empty((C, 2, 6)), np.empty(C), np.empty(C)
-        memory = contact_memory(C, 6, 2)
-        rows, y, rows_ = np.empty((3 * C, 6)), np.empty(3 * C), np.empty((3 * C, 6))
-        sticks, mu_i, soft, index = np.empty(C, np.bool_), np.empty(C), np.empty(C), np.empty(C, np.int64)
-        target_, mu_, soft_, share, nothing = np.empty(C), np.empty(C), np.empty(C), np.empty(C), np.zeros(3 * C)
-        free, free_, v, v_, x_ = np.empty(6), np.empty(6), np.empty(6), np.empty(6), np.empty(13)
-        R, R_ = np.empty((3, 3)), np.empty((3, 3))
+        memory, loaded, gradients = contact_memory(C, 6, 2), _loaded_memory(C), _loaded_gradients(C)
+        rows, y, sticks, mu, soft, _, _ = loaded
+        rows_, target_, mu_, soft_, nothing = gradients
+        approached = _approach_memory(C)
+        free, normal, tangents, gap, closing = approached
+        free_, v_, x_, R, R_ = np.empty(6), np.empty(6), np.empty(13), np.empty((3, 3)), np.empty((3, 3))
         for b in range(B):
             m = mass[b]
-            radius, restitution, mu, mu_impact = numbers[b, 0], numbers[b, 1], numbers[b, 2], numbers[b, 3]
             for t in range(T - 1, -1, -1):
+                if not solved[b, t]:
+                    continue
                 x, after, after_ = states[b, t], states[b, t + 1], states_[b, t + 1]
                 rotation(x[3:7], R)
                 approach(
                     x, R, gravity[b], force[b, t], corners[b], m, numbers[b], dt, newton, gyroscopic, free, normal,
                     tangents, gap, closing,
                 )  # fmt: skip
-                x_[:] = 0.0
-                R_[:, :] = 0.0
-                for k in range(6):
-                    v[k] = after[7 + k]
-                    v_[k] = after_[7 + k]
+                x_[:], R_[:, :] = 0.0, 0.0
+                v_[:] = after_[7:]
                 for k in range(3):
                     x_[k] = after_[k]
                     v_[k] += dt * after_[k]
-                _turn_back(x, after, v, dt, after_, v_, x_)
-                K = 0
-                for i in range(C):
-                    if loads[b, t, i] > 0.0:
-                        index[K], sticks[K] = i, sticking[b, t, i]
-                        share[K] = min(closing[i] / impact_speed, 1.0)
-                        mu_i[K], soft[K] = mu + (mu_impact - mu) * share[K], numbers[b, 5]
-                        y[3 * K] = loads[b, t, i]
-                        rows[3 * K] = normal[i]
-                        for d in range(2):
-                            y[3 * K + 1 + d] = frictions[b, t, i, d]
-                            rows[3 * K + 1 + d] = tangents[i, d]
-                        K += 1
-                free_[:] = 0.0
-                if solved[b, t]:
-                    free_[:] = v_
-                    if K:
-                        pull_back_contacts(
-                            K, 2, 6, rows, y, sticks, mu_i, soft, free, m, v_, nothing, memory, free_, rows_, target_,
-                            mu_, soft_, mass_[b],
-                        )  # fmt: skip
-                else:
-                    K = 0
+                _turn_back(x, after, after[7:], dt, after_, v_, x_)
+                K = _gather(loads[b, t], frictions[b, t], sticking[b, t], approached, numbers[b], impact_speed, loaded)
+                free_[:] = v_
+                if K:
+                    pull_back_contacts(
+                        K, 2, 6, rows, y, sticks, mu, soft, free, m, v_, nothing, memory, free_, rows_, target_, mu_,
+                        soft_, mass_[b],
+                    )  # fmt: skip
                 for i in range(K):
-                    j = index[i]
-                    bounce_, gap_, closing_ = target_[i], -target_[i] / dt, 0.0
-                    if newton:
-                        bounce = restitution * closing[j]
-                        if bounce > 0.0 and bounce + gap[j] / dt > 0.0:
-                            gap_ += target_[i] / dt
-                        else:
-                            bounce_ = 0.0
-                    numbers_[b, 1] += bounce_ * closing[j]
-                    closing_ += bounce_ * restitution
-                    numbers_[b, 2] += mu_[i] * (1.0 - share[i])
-                    numbers_[b, 3] += mu_[i] * share[i]
-                    if share[i] < 1.0:
-                        closing_ += mu_[i] * (mu_impact - mu) / impact_speed
-                    numbers_[b, 5] += soft_[i]
-                    if closing[j] > 0.0:  # closing = -n x' and, by the continuous law, less gap / dt
-                        for k in range(6):
-                            rows_[3 * i, k] -= closing_ * x[7 + k]
-                            x_[7 + k] -= closing_ * normal[j, k]
-                        if not newton and gap[j] > 0.0:
-                            gap_ -= closing_ / dt
-                    _corner_back(
-                        corners[b, j], R, rows_[3 * i : 3 * i + 3], gap_, radius, corners_[b, j], R_, numbers_[b], x_
-                    )
-                for k in range(6):
-                    force_[b, t, k] = dt * free_[k] / m[k]
-                    mass_[b, k] -= dt * force[b, t, k] * free_[k] / m[k] ** 2
-                for k in range(3):
-                    gravity_[b, k] += dt * free_[k]
-                    x_[7 + k] += free_[k]
-                if gyroscopic:
-                    v[:3] = x_[10:13]
-                    _spin_back(x[10:13], free[3:], m[3:], dt, force[b, t, 3:], free_, x_, mass_[b, 3:])
-                    x_[10:13] += v[:3]
-                else:
-                    x_[10:13] += free_[3:]
+                    _contact_back(
+                        i, dt, newton, impact_speed, x, R, corners[b], numbers[b], approached, loaded, gradients,
+                        corners_[b], R_, numbers_[b], x_,
+                    )  # fmt: skip
+                _free_back(x, free, gyroscopic, m, dt, force[b, t], free_, x_, force_[b, t], mass_[b], gravity_[b])
                 _rotation_back(x, R_, x_)
                 for k in range(13):
                     states_[b, t, k] += x_[k]
@@ -250,6 +293,7 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+        refuse_batched((gradient,))
         given, rolled = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
         return (None, *pull_back(given, ctx.options, Rolled(*(x.detach().numpy() for x in rolled)), gradient))
 

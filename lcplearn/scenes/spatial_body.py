@@ -29,6 +29,9 @@ class SpatialBody:
     Friction may differ at impacts: mu + (mu_impact - mu) min(1, closing / impact_speed), with the closing speed of
     `closing_speed`.
 
+    Gradient: implicit, through all steps, with respect to the state, the drive and all numbers (see `contact_step`).
+    A compiled step that is not solved passes none on.
+
     Attributes:
         corners: Centres of the spheres in body coordinates [m], [C, 3] or [*batch, C, 3]; the origin is the centre of
             mass.

@@ -72,26 +72,55 @@ def boxes(count: int, seed: int, compliance: float = 0.0) -> tuple[Contacts, Ten
     flat = torch.stack((yaw.cos(), 0.0 * yaw, 0.0 * yaw, yaw.sin()), dim=-1)
     quaternion = torch.where(uniform(count, 1) < 0.35, flat, torch.randn(count, 4, generator=draw))
     turn = rotation_matrix(quaternion / quaternion.norm(dim=-1, keepdim=True))
-    corners = box_corners(half)
-    height = (corners @ turn.mT)[..., 2]
     above = torch.where(uniform(count, 1) < 0.6, 0.0, 0.05 * uniform(count, 1))
+    mass = (0.5 + uniform(count, 1)).expand(count, 6).clone()
+    mass[:, 3:] *= (half.square().sum(-1, keepdim=True) - half.square()) / 3.0
+    free = _free(mass, draw, torch.ones(6), torch.tensor([0.0, 0.0, -9.81 * DT, 0.0, 0.0, 0.0]))
+    mu, soft = 1.2 * uniform(count, 1), torch.tensor(compliance)
+    return _box_contacts(half, turn, above, mu, soft), free, mass
+
+
+def resting_boxes(count: int, seed: int, still: bool = False) -> tuple[Contacts, Tensor, Tensor]:
+    """Boxes on the ground, almost flat, almost at rest, or in it and without any free velocity (still).
+
+    Angles, depths and speeds are drawn from 1 down to 1e-10. Corners then contradict each other at all these scales.
+    """
+    draw = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=draw)
+
+    half, yaw = 0.02 + 0.06 * uniform(count, 3), math.pi * uniform(count)
+    flat = torch.stack((yaw.cos(), 0.0 * yaw, 0.0 * yaw, yaw.sin()), dim=-1)
+    quaternion = flat + 10.0 ** (-8.0 * uniform(count, 1)) * torch.randn(count, 4, generator=draw)
+    turn = rotation_matrix(quaternion / quaternion.norm(dim=-1, keepdim=True))
+    depth = torch.where(uniform(count, 1) < 0.5 * (not still), 0.0, 0.005 * 10.0 ** (-10.0 * uniform(count, 1)))
+    mass = torch.full((count, 6), 0.3)
+    mass[:, 3:] *= (half.square().sum(-1, keepdim=True) - half.square()) / 3.0
+    speed = 10.0 ** (-10.0 * uniform(count, 1)) * torch.tensor([1.0, 1.0, 0.3, 20.0, 20.0, 20.0])
+    free = speed * torch.randn(count, 6, generator=draw) - torch.tensor([0.0, 0.0, 9.81 * DT, 0.0, 0.0, 0.0])
+    mu = torch.where(uniform(count, 1) < 0.2, 0.0, 10.0 ** (2.5 * uniform(count, 1) - 2.0))
+    compliance = torch.where(uniform(count, 1) < 0.5, 0.0, 1e-3)
+    return _box_contacts(half, turn, -depth, mu, compliance), 0.0 * free if still else free, mass
+
+
+def _box_contacts(half: Tensor, turn: Tensor, above: Tensor, mu: Tensor, compliance: Tensor) -> Contacts:
+    """The corners of boxes, the lowest of them at a height above the ground."""
+    count, corners = len(half), box_corners(half)
+    height = (corners @ turn.mT)[..., 2]
     linear = torch.eye(3).expand(count, 8, 3, 3)
     angular = torch.linalg.cross(
         corners.unsqueeze(-2).expand(count, 8, 3, 3), turn.unsqueeze(-3).expand(count, 8, 3, 3)
     )
     rows = torch.cat((linear, angular), dim=-1)
-    mass = (0.5 + uniform(count, 1)).expand(count, 6).clone()
-    mass[:, 3:] *= (half.square().sum(-1, keepdim=True) - half.square()) / 3.0
-    free = _free(mass, draw, torch.ones(6), torch.tensor([0.0, 0.0, -9.81 * DT, 0.0, 0.0, 0.0]))
-    contacts = Contacts(
+    return Contacts(
         gap=height - height.amin(-1, keepdim=True) + above,
         normal=rows[..., 2, :],
         tangents=rows[..., :2, :],
-        mu=1.2 * uniform(count, 1).expand(count, 8),
+        mu=mu.expand(count, 8),
         bounce=torch.zeros(count, 8),
-        compliance=torch.full((count, 8), compliance),
+        compliance=compliance.expand(count, 8),
     )
-    return contacts, free, mass
 
 
 def _free(mass: Tensor, draw: torch.Generator, spread: Tensor, fall: Tensor) -> Tensor:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from real_data import real_data
-from scenes.contact_scenes import DT, boxes, polygons, violation
+from scenes.contact_scenes import DT, boxes, polygons, resting_boxes, violation
 from torch import Tensor
 
 from lcplearn.scenes.contact import Contacts, _flatten, closing_speed, compiled_contacts, contact_step, rebound
@@ -23,13 +23,36 @@ pytestmark = pytest.mark.usefixtures("double_precision")
 
 @settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 2**31))
+@example(seed=28794637)  # a load on redundant corners that only compliance decides
 def test_what_the_needed_rows_give_solves_the_law_of_all_contacts(seed):
     torch.set_default_dtype(torch.float64)
     for scene in (polygons(30, seed), boxes(30, seed), boxes(30, seed, compliance=1e-3)):
         step = contact_step(*scene, DT, rest=False)  # which writes 0 for a velocity that compliance leaves
         right, wrong = step.solved & step.settled, violation(*scene, step)
-        assert (right & (wrong < 1e-12)).sum() >= 29  # of 60,000 boxes one creeps
-        assert wrong[right].amax() < 1e-6
+        assert (right & (wrong < 1e-12)).sum() >= 29  # of a million boxes one does not settle, two to 5e-11 only
+        assert wrong[right].amax() < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_boxes_that_come_to_rest_settle(seed):
+    """Here corners contradict each other; without `FINE_CREEP` 5 % break the law by up to 1e-7 and 1 % don't settle."""
+    scene = resting_boxes(1000, seed)
+    step = contact_step(*scene, DT, rest=False)
+    right, wrong = step.solved & step.settled, violation(*scene, step)
+    assert right.sum() >= 999
+    assert (wrong < 1e-12).double().mean() > 0.99
+    assert wrong[right].amax() < 1e-8
+
+
+def test_a_corner_in_the_ground_settles_without_any_free_velocity():
+    """What the gap demands is then the only scale of speeds."""
+    scene = resting_boxes(500, 3, still=True)
+    step = contact_step(*scene, DT, rest=False)
+    assert (step.solved & step.settled).all()
+    wrong = violation(*scene, step)
+    assert (wrong < 1e-12).double().mean() > 0.98
+    assert wrong.amax() < 1e-9
+    assert (step.velocity != 0.0).any(-1).all()
 
 
 def test_rows_of_all_contacts_give_the_same_velocity():
@@ -149,26 +172,38 @@ def test_a_batch_is_its_elements_and_corners_can_be_renumbered(scene):
     assert (other.velocity - together.velocity)[right].abs().amax() < 1e-8
 
 
-def test_gradients_with_needed_rows_are_those_of_differences_and_of_all_rows():
+@pytest.mark.parametrize("name", ["mu", "gap", "normal", "tangents", "bounce", "compliance", "free", "mass"])
+def test_gradients_with_needed_rows_are_those_of_differences(name):
     contacts, free, mass = boxes(40, 1, compliance=1e-3)
-    weights = torch.randn(40, 6, generator=torch.Generator().manual_seed(2))
+    given = {**contacts._asdict(), "free": free, "mass": mass}
+    draw = torch.Generator().manual_seed(2)
+    weights, direction = torch.randn(40, 6, generator=draw), torch.randn(given[name].shape, generator=draw)
+    if name in ("mu", "compliance", "mass"):  # numbers that must not become negative
+        direction = direction * given[name]
 
-    def outcome(mu: Tensor, free: Tensor) -> Tensor:
-        return (weights * contact_step(contacts._replace(mu=mu), free, mass, DT).velocity).sum(-1)
+    def outcome(value: Tensor) -> Tensor:
+        new = given | {name: value}
+        found = contact_step(Contacts(*(new[field] for field in Contacts._fields)), new["free"], new["mass"], DT)
+        return (weights * found.velocity).sum(-1)
 
-    mu, start = contacts.mu.clone().requires_grad_(), free.clone().requires_grad_()
-    to_mu, to_free = torch.autograd.grad(outcome(mu, start).sum(), (mu, start))
-    direction = torch.randn(40, 6, generator=torch.Generator().manual_seed(4))
-    checks = (
-        (to_mu.sum(-1), lambda h: (contacts.mu + h, free)),
-        ((to_free * direction).sum(-1), lambda h: (contacts.mu, free + h * direction)),
-    )
-    for gradient, change in checks:
-        both = [(outcome(*change(h)) - outcome(*change(-h))) / (2 * h) for h in (1e-5, 1e-6)]
-        scale = both[1].abs().clamp_min(1e-2)
-        smooth = (both[0] - both[1]).abs() <= 1e-4 * scale
-        assert smooth.double().mean() >= 0.9
-        assert ((gradient - both[1]).abs() <= 1e-4 * scale)[smooth].double().mean() >= 0.98
+    start = given[name].clone().requires_grad_()
+    gradient = (torch.autograd.grad(outcome(start).sum(), start)[0] * direction).flatten(1).sum(-1)
+    with torch.no_grad():
+        rough, fine = (
+            (outcome(start + h * direction) - outcome(start - h * direction)) / (2 * h) for h in (1e-5, 1e-6)
+        )
+    scale = fine.abs().clamp_min(1e-2)
+    smooth = (rough - fine).abs() <= 1e-4 * scale
+    assert smooth.double().mean() >= 0.9
+    assert (fine.abs() > 1e-6).double().mean() > (0.0 if name == "bounce" else 0.3)
+    assert ((gradient - fine).abs() <= 1e-4 * scale)[smooth].double().mean() >= 0.98
+
+
+def test_a_batch_of_gradients_is_refused():
+    contacts, free, mass = boxes(2, 1)
+    velocity = contact_step(contacts, free.requires_grad_(), mass, DT).velocity
+    with pytest.raises(RuntimeError, match="can't be batched"):
+        torch.autograd.grad(velocity, free, torch.ones(3, 2, 6), is_grads_batched=True)
 
 
 def test_a_polygon_of_many_directions_comes_close_to_the_cone():
@@ -279,3 +314,17 @@ def test_the_compiled_step_and_its_gradient_are_those_of_torch(scene, compliance
     close = 1e-9 if compliance else 1e-11  # a small compliance makes loads unique, and sensitive
     for mine, wanted in zip(gradients, expected, strict=True):
         torch.testing.assert_close(mine, wanted, rtol=0, atol=close * float(1.0 + wanted.abs().amax()))
+
+
+def test_compiled_code_is_found_by_the_types_it_is_for():
+    pytest.importorskip("numba")
+    from lcplearn.scenes.contact_kernel.compiling import address_of, compiled
+
+    def half(x):
+        return x / 2
+
+    fast = compiled(half)
+    fast(1), fast(1.0)
+    whole, real = address_of(fast, 1), address_of(fast, 1.0)
+    assert whole != real
+    assert address_of(fast, 3) == whole

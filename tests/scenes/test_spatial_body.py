@@ -78,6 +78,37 @@ def test_gradients_of_a_step_are_those_of_differences():
     assert ((gradient - fine).abs() <= 1e-4 * scale)[smooth].double().mean() >= 0.99
 
 
+@pytest.mark.parametrize("name", ["start", "corners", "inertia", "gravity", "force"])
+def test_gradients_of_a_rollout_are_those_of_differences(name):
+    draw = torch.Generator().manual_seed(8)
+    given = {"start": tossed(40, seed=4), "corners": CORNERS.expand(40, 8, 3), "force": torch.zeros(40, 4, 6)}
+    given |= {"inertia": torch.tensor([0.0011, 0.001, 0.0008]).expand(40, 3)}
+    given |= {"gravity": torch.tensor([0.4, 0.0, -9.81]).expand(40, 3)}
+    weights, direction = torch.randn(40, 13, generator=draw), torch.randn(given[name].shape, generator=draw)
+    if name in ("corners", "inertia"):
+        direction = 0.1 * direction * given[name].abs()
+
+    def outcome(value: Tensor) -> Tensor:
+        new = given | {name: value}
+        scene = body(
+            corners=new["corners"], inertia=new["inertia"].unbind(-1), gravity=new["gravity"], compliance=1e-3, mu=0.3
+        )
+        path = scene.rollout(new["start"], Drive(new["force"]))
+        return (weights * path.states[:, -1]).sum(-1)
+
+    value = given[name].clone().requires_grad_()
+    gradient = (torch.autograd.grad(outcome(value).sum(), value)[0] * direction).flatten(1).sum(-1)
+    with torch.no_grad():
+        rough, fine = (
+            (outcome(value + h * direction) - outcome(value - h * direction)) / (2 * h) for h in (1e-6, 1e-7)
+        )
+    scale = fine.abs().clamp_min(1e-2)
+    smooth = (rough - fine).abs() <= 1e-4 * scale
+    assert smooth.double().mean() >= 0.8
+    assert (fine.abs() > 1e-4).double().mean() > 0.5
+    assert ((gradient - fine).abs() <= 3e-4 * scale)[smooth].double().mean() >= 0.95
+
+
 @pytest.mark.parametrize("slope", [0.0, 0.2])
 def test_a_box_rests_exactly(slope):
     gravity = 9.81 * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)])
@@ -274,6 +305,29 @@ def test_a_state_of_nan_is_not_solved_and_harms_no_neighbour():
         step, alone = body().advance(state, NOTHING), body().advance(state[2:], NOTHING)
     assert step.solved.tolist() == [True, False, True]
     assert (step.state[2] == alone.state[0]).all()
+
+
+def test_a_state_of_nan_harms_no_neighbours_gradient():
+    pytest.importorskip("numba")
+    steps = torch.zeros(3, 6, 6)
+
+    def slope(state: Tensor) -> Tensor:
+        mu = torch.tensor(0.3, requires_grad=True)
+        path = body(mu=mu, compliance=1e-3).rollout(state, Drive(steps[: len(state)]))
+        return torch.autograd.grad(path.states.square().sum(), mu)[0]
+
+    for column in (2, 4, 9, 11):  # height, quaternion, velocity, spin
+        state = tossed(3)
+        state[1, column] = torch.nan
+        torch.testing.assert_close(slope(state), slope(state[[0, 2]]), rtol=1e-12, atol=0.0)
+
+
+def test_a_batch_of_gradients_is_refused():
+    pytest.importorskip("numba")
+    state = tossed(2).requires_grad_()
+    end = body().advance(state, NOTHING).state
+    with pytest.raises(RuntimeError, match="can't be batched"):
+        torch.autograd.grad(end, state, torch.ones(3, 2, 13), is_grads_batched=True)
 
 
 @pytest.mark.parametrize("law", ["newton", "continuous"])

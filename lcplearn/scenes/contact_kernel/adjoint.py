@@ -147,50 +147,38 @@ def contact_memory(C, nv, T):
 
 
 @compiled
-def pull_back_contacts(
-    K, T, nv, rows, y, sticks, mu, compliance, free, mass, gradient, y_gradient, memory, to_free, to_rows, to_target,
-    to_mu, to_compliance, to_mass,
-):  # fmt: skip
-    """From the gradients of velocity and impulses to those with respect to what a step of contacts takes.
-
-    Args:
-        rows: Jacobians [(1 + T) K, nv] of the K loaded contacts; each contact's normal, then its T tangents.
-        y: Impulses along the rows; sticks, mu, compliance [K]; free, mass [nv]: as the step had them.
-        gradient: With respect to the velocity after the step; y_gradient: with respect to y.
-        to_free, to_rows, to_target, to_mu, to_compliance: Where gradients are written; to_mass is added to.
-    """
-    slope, right, order, scales, wanted, s, speed_gradient, slip, unit, stuck, push, v = memory
+def _modes(K, T, nv, rows, y, sticks, mu, compliance, free, mass, push, v, unit, slip, stuck):
+    """Velocity v after the step, mobility and slip of each contact, and which have no direction of slip."""
     w = 1 + T
+    energy, demanded = 0.0, 0.0
     for k in range(nv):
         push[k] = 0.0
         for i in range(w * K):
             push[k] += rows[i, k] * y[i]
         v[k] = free[k] + push[k] / mass[k]
-    energy = 0.0
-    for k in range(nv):
         energy += mass[k] * free[k] ** 2
     for c in range(K):
-        unit[c], size = 0.0, 0.0
+        unit[c], target = 0.0, compliance[c] * y[w * c]
         for k in range(nv):
             unit[c] += rows[w * c, k] ** 2 / mass[k]
+            target += rows[w * c, k] * v[k]
+        demanded = max(demanded, target / sqrt(max(unit[c], 1e-300)))
+    for c in range(K):
+        size = 0.0
         for t in range(T):
             slip[c, t] = 0.0
             for k in range(nv):
                 slip[c, t] += rows[w * c + 1 + t, k] * v[k]
             size += slip[c, t] ** 2
-        stuck[c] = sticks[c] or sqrt(size) <= CREEPS * sqrt(unit[c] * energy)
+        stuck[c] = sticks[c] or sqrt(size) <= CREEPS * sqrt(unit[c]) * (sqrt(energy) + demanded)
         if stuck[c] and not mu[c] * y[w * c] > 0.0:  # what has no friction is held by nothing
             stuck[c], slip[c, :] = False, 0.0
-    for i in range(w * K):
-        wanted[i] = y_gradient[i]
-        for k in range(nv):
-            wanted[i] += rows[i, k] * gradient[k] / mass[k]
-    _slope(K, T, nv, rows, y, slip, stuck, unit, mass, mu, compliance, slope)
-    if _factorise(slope, scales, order, w * K):
-        _solve_transposed(slope, scales, order, w * K, wanted, s)
-    else:
-        _slope(K, T, nv, rows, y, slip, stuck, unit, mass, mu, compliance, slope)
-        _smallest_solution(slope, right, w * K, wanted, s)
+
+
+@compiled
+def _to_speeds(K, T, y, mu, unit, slip, stuck, s, speed_gradient, to_target, to_mu, to_compliance):
+    """From s to the gradients with respect to the speeds of the rows, and to the numbers of the law."""
+    w = 1 + T
     for c in range(K):
         to_target[c] = s[w * c]
         to_compliance[c] = -s[w * c] * y[w * c]
@@ -210,6 +198,35 @@ def pull_back_contacts(
         turning = unit[c] * mu[c] * y[w * c] / size
         for t in range(T):
             speed_gradient[w * c + 1 + t] = -turning * (s[w * c + 1 + t] - along * slip[c, t] / size)
+
+
+@compiled
+def pull_back_contacts(
+    K, T, nv, rows, y, sticks, mu, compliance, free, mass, gradient, y_gradient, memory, to_free, to_rows, to_target,
+    to_mu, to_compliance, to_mass,
+):  # fmt: skip
+    """From the gradients of velocity and impulses to those with respect to what a step of contacts takes.
+
+    Args:
+        rows: Jacobians [(1 + T) K, nv] of the K loaded contacts; each contact's normal, then its T tangents.
+        y: Impulses along the rows; sticks, mu, compliance [K]; free, mass [nv]: as the step had them.
+        gradient: With respect to the velocity after the step; y_gradient: with respect to y.
+        to_free, to_rows, to_target, to_mu, to_compliance: Where gradients are written; to_mass is added to.
+    """
+    slope, right, order, scales, wanted, s, speed_gradient, slip, unit, stuck, push, v = memory
+    w = 1 + T
+    _modes(K, T, nv, rows, y, sticks, mu, compliance, free, mass, push, v, unit, slip, stuck)
+    for i in range(w * K):
+        wanted[i] = y_gradient[i]
+        for k in range(nv):
+            wanted[i] += rows[i, k] * gradient[k] / mass[k]
+    _slope(K, T, nv, rows, y, slip, stuck, unit, mass, mu, compliance, slope)
+    if _factorise(slope, scales, order, w * K):
+        _solve_transposed(slope, scales, order, w * K, wanted, s)
+    else:
+        _slope(K, T, nv, rows, y, slip, stuck, unit, mass, mu, compliance, slope)
+        _smallest_solution(slope, right, w * K, wanted, s)
+    _to_speeds(K, T, y, mu, unit, slip, stuck, s, speed_gradient, to_target, to_mu, to_compliance)
     for k in range(nv):
         to_free[k] = gradient[k]
         for i in range(w * K):

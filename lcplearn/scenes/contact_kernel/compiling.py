@@ -3,19 +3,24 @@
 A big function that others need is compiled once and called by its address: inlined it would be compiled in each.
 """
 
+from collections.abc import Iterable
 from functools import cache
 from hashlib import sha256
 from inspect import unwrap
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from llvmlite import ir
+from numba import typeof
 from numba.core import cgutils, types
 from numba.extending import intrinsic
+from torch import Tensor
 
 from lcplearn.lcp import pivoting
 from lcplearn.lcp.kernel import jit
+from lcplearn.lcp.torch_internals import mapped_by_autograd
 
 
 def compiled(function: Any, cached: bool = False) -> Any:
@@ -35,10 +40,25 @@ def fingerprint(*files: str) -> str:
     return sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
-def address_of(function: Any) -> int:
-    """Where the code of a compiled function is; it must have been called with one set of types."""
-    (code,) = function.overloads.values()
+def address_of(function: Any, *arguments: Any) -> int:
+    """Where the code of a compiled function is, for arguments of the types of these."""
+    signature = tuple(typeof(x) for x in arguments)
+    function.compile(signature)  # does nothing where it is compiled
+    code = function.overloads[signature]
     return int(code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name))
+
+
+def refuse_batched(gradients: Iterable[Tensor]) -> None:
+    """A compiled gradient has numbers to look at, not a tensor that stands for many.
+
+    Raises:
+        RuntimeError: `torch.autograd.grad(..., is_grads_batched=True)` or a vectorised Jacobian asks for it.
+    """
+    if any(mapped_by_autograd(x) for x in gradients):
+        raise RuntimeError(
+            "gradients of compiled scenes can't be batched (is_grads_batched or vectorize=True): ask for one after the "
+            "other, or repeat the scene along a batch dimension"
+        )
 
 
 def _call_code(_: Any, address: Any, arguments: Any) -> Any:
@@ -61,4 +81,5 @@ def solver_address() -> int:
     """Where the layer's compiled solver is."""
     M, q = torch.eye(2, dtype=torch.float64), -torch.ones(2, dtype=torch.float64)
     pivoting.solve_batch(M, q, single_precision=False, max_iter=None)
-    return address_of(pivoting.solve_range)
+    places = (0,) * 7
+    return address_of(pivoting.solve_range, 1, 2, False, 0, 0, 1e-10, False, -1, False, np.empty(1), *places)

@@ -8,16 +8,16 @@ from lcplearn.lcp.kernel.memory import scratch_size
 from lcplearn.scenes.contact_kernel.compiling import compiled
 from lcplearn.scenes.contact_kernel.rows import apply, condense, cone_rows, delassus, mass_norm, rotate, solve_lcp
 from lcplearn.scenes.friction_lcp import (
-    CREEP,
-    CREEPS,
     CRUDE,
+    LAST_RESORT,
     MAX_ITERATIONS,
-    PATIENCE,
     PLAIN,
-    PROXIMAL,
     SETTLED,
     STAYS,
+    regularisation,
 )
+
+_regularisation = compiled(regularisation)
 
 
 @compiled
@@ -32,17 +32,17 @@ def workspace(C, nv):
 
 
 @compiled
-def _choose_axes(slip, friction, load, sticks, mu, scale, K, axes, root):
+def _choose_axes(slip, friction, load, sticks, mu, scale, creep, K, axes, root):
     """Facets along the slip or against the friction force, and the root of the weight across them."""
     for i in range(K):
         speed = sqrt(slip[i, 0] ** 2 + slip[i, 1] ** 2)
-        creep = CREEP * scale[i]
+        still = creep * scale[i]
         x, y = slip[i, 0], slip[i, 1]
-        if sticks[i] or speed <= CREEPS * scale[i]:
+        if sticks[i] or speed <= 10.0 * still:
             x, y = -friction[i, 0], -friction[i, 1]
         length = sqrt(x * x + y * y)
         axes[i, 0], axes[i, 1] = (x / length, y / length) if length > 0.0 else (1.0, 0.0)
-        floor = creep if sticks[i] else max(speed, creep)
+        floor = still if sticks[i] else max(speed, still)
         root[i] = sqrt(mu[i] * load[i] / floor) if floor > 0.0 else 0.0
 
 
@@ -106,12 +106,12 @@ def solve_cone(
     size, old, was_damped = mass_norm(mass, free, nv), np.inf, False
     solved = settled = False
     for iteration in range(MAX_ITERATIONS):
-        proximal = PROXIMAL if iteration >= PLAIN else 0.0
+        proximal, creep = _regularisation(iteration)
         for i in range(K):
             soft[i] = compliance[i] + proximal * D[i, i]
             goal[i] = target[i] + proximal * D[i, i] * load[i]
             old_load[i], old_friction[i, 0], old_friction[i, 1] = load[i], friction[i, 0], friction[i, 1]
-        _choose_axes(slip, friction, load, sticks, mu, scale, K, axes, root)
+        _choose_axes(slip, friction, load, sticks, mu, scale, creep, K, axes, root)
         rotate(D, u, axes, K, A, r)
         condense(A, r, root, K, H, X)
         cone_rows(A, r, goal, mu, soft, K, M, q)
@@ -125,7 +125,7 @@ def solve_cone(
             v[k] -= v_new[k]
         change = mass_norm(mass, v, nv)
         stays = change <= STAYS * (size + mass_norm(mass, v_new, nv))
-        settled = wrong <= SETTLED or (stays and wrong <= CRUDE and iteration >= PATIENCE)
+        settled = wrong <= SETTLED or (stays and wrong <= CRUDE and iteration >= LAST_RESORT)
         if (settled and solved) or iteration == MAX_ITERATIONS - 1:
             break
         damped = change > 0.3 * old and not was_damped and 3 < iteration < PLAIN

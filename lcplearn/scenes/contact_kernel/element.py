@@ -8,7 +8,7 @@ from lcplearn.lcp.kernel.jit import LARGEST
 from lcplearn.scenes.contact_kernel.compiling import compiled
 from lcplearn.scenes.contact_kernel.cone import solve_cone
 from lcplearn.scenes.contact_kernel.rows import apply, cholesky, cone_rows, delassus, mass_norm, solve_lcp
-from lcplearn.scenes.friction_lcp import DEAD_ZONE, FULL_RANK, ROUNDING
+from lcplearn.scenes.friction_lcp import DEAD_SLIP, DEAD_ZONE, FULL_RANK, ROUNDING
 
 
 @compiled
@@ -58,7 +58,14 @@ def _rests(C, nv, T, target, normal, tangents, compliance, mass, scale, v, load,
         limit = DEAD_ZONE * scale[i] + compliance[i] * whole_load
         if not (abs(speed) <= limit and speed - target[i] <= limit):
             continue
-        kept = 1 + (T if load[i] > 0.0 and sticks[i] else 0)
+        slip = 0.0
+        for d in range(T):
+            along = 0.0
+            for k in range(nv):
+                along += tangents[i, d, k] * v[k]
+            slip += along * along
+        holds = load[i] > 0.0 and (sticks[i] or sqrt(slip) <= DEAD_SLIP * scale[i])
+        kept = 1 + (T if holds else 0)
         held += kept
         for d in range(kept):
             row = normal[i] if d == 0 else tangents[i, d - 1]
@@ -87,27 +94,52 @@ def _members(active, index):
 
 
 @compiled
+def _closing(C, nv, target, normal, free, mass, scale, active):
+    """How many contacts close in free flight, and whether all is finite; scale is `Problem.speed_scale`."""
+    finite, count, demanded = True, 0, 0.0
+    for i in range(C):
+        speed, alone = 0.0, 0.0
+        for k in range(nv):
+            speed += normal[i, k] * free[k]
+            alone += normal[i, k] ** 2 / mass[k]
+        scale[i] = sqrt(alone)
+        demanded = max(demanded, target[i] / max(scale[i], 1e-300))
+        active[i] = speed - target[i] < 0.0
+        count += active[i]
+        finite = finite and abs(speed - target[i]) <= LARGEST
+    size = mass_norm(mass, free, nv) + demanded
+    for i in range(C):
+        scale[i] *= size
+    return count, finite
+
+
+@compiled
+def _wrong(C, nv, target, normal, v, scale, active):
+    """How many contacts without rows the solution violates, and whether all is finite; they become active."""
+    finite, count = True, 0
+    for i in range(C):
+        speed = 0.0
+        for k in range(nv):
+            speed += normal[i, k] * v[k]
+        finite = finite and abs(speed) <= LARGEST
+        if not active[i] and speed - target[i] < -ROUNDING * scale[i]:
+            active[i] = True
+            count += 1
+    return count, finite
+
+
+@compiled
 def solve_element(
     address, C, nv, T, rest, target, normal, tangents, mu, compliance, free, mass, numbers, part, rows, index, active,
     gram, scale, v, load, friction, sticks,
 ):  # fmt: skip
     """Solve the contacts of one element: solved, settled, at rest. What is not needed is left out, then checked."""
     part_target, part_mu, part_compliance, part_scale, part_load, part_friction, part_slip, part_sticks = part
-    size = mass_norm(mass, free, nv)
-    finite, added = True, 0
+    added, finite = _closing(C, nv, target, normal, free, mass, scale, active)
+    load[:], sticks[:], v[:] = 0.0, False, free
     for i in range(C):
-        speed, alone = 0.0, 0.0
-        for k in range(nv):
-            speed += normal[i, k] * free[k]
-            alone += normal[i, k] ** 2 / mass[k]
-        scale[i] = sqrt(alone) * size
-        load[i], sticks[i] = 0.0, False
         for d in range(T):
             friction[i, d] = 0.0
-        active[i] = speed - target[i] < 0.0
-        added += active[i]
-        finite = finite and abs(speed - target[i]) <= LARGEST
-    v[:] = free
     solved, settled = finite, True
     while added > 0:
         K = _members(active, index)
@@ -134,15 +166,8 @@ def solve_element(
             load[j], sticks[j] = part_load[i], part_sticks[i]
             for d in range(T):
                 friction[j, d] = part_friction[i, d]
-        added = 0
-        for i in range(C):
-            speed = 0.0
-            for k in range(nv):
-                speed += normal[i, k] * v[k]
-            finite = finite and abs(speed) <= LARGEST
-            if not active[i] and speed - target[i] < -ROUNDING * scale[i]:
-                active[i] = True
-                added += 1
+        added, still_finite = _wrong(C, nv, target, normal, v, scale, active)
+        finite = finite and still_finite
     solved = solved and finite
     at_rest = (
         rest

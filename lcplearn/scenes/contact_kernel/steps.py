@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
-from lcplearn.scenes.contact_kernel.compiling import address_of, compiled, fingerprint, solver_address
+from lcplearn.scenes.contact_kernel.compiling import (
+    address_of,
+    compiled,
+    fingerprint,
+    refuse_batched,
+    solver_address,
+)
 from lcplearn.scenes.contact_kernel.cone import workspace
 from lcplearn.scenes.contact_kernel.element import parts, solve_element
 from lcplearn.scenes.friction_lcp import Answer, Problem
@@ -83,13 +89,10 @@ _pull_back_all = _make_pull_back_all(fingerprint("contact_gradient.py"))
 @cache
 def contacts_address() -> int:
     """Where the compiled solver of contacts is; called as `_solve_all` is."""
-    one, row, rows = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
-    flags = np.empty((1, 3), np.bool_)
-    _solve_all(
-        solver_address(), True, -one, row, rows, one, one, one, one, one.copy(), one.copy(), row.copy(),
-        flags[:, :1].copy(), flags,
+    one, row, rows, flags = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1)), np.ones((1, 1), np.bool_)
+    return address_of(
+        _solve_all, solver_address(), True, one, row, rows, one, one, one, one, one, one, row, flags, flags
     )  # fmt: skip
-    return address_of(_solve_all)
 
 
 class Solved(NamedTuple):
@@ -134,6 +137,7 @@ class _Contacts(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        refuse_batched(gradients[:3])
         saved = [x.detach().contiguous().numpy() for x in ctx.saved_tensors]
         given, found = saved[: len(Problem._fields)], saved[len(Problem._fields) :]
         results = [np.zeros(x.shape) for x in given]
