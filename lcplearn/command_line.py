@@ -7,6 +7,7 @@ import itertools
 import re
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,7 +77,8 @@ def settle(folder: Path | None) -> None:
     if all(path.name == "multirun.yaml" or path.parent.name == ".hydra" for path in files):
         shutil.rmtree(folder)
         return
-    _link(folder, folder.with_name("latest"))
+    with suppress(OSError):  # a disk without links, or another run that ends at the same moment
+        _link(folder, folder.with_name("latest"))
 
 
 def _link(folder: Path, latest: Path) -> None:

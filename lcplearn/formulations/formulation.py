@@ -158,7 +158,7 @@ def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
         arguments: The other constructor arguments.
 
     Raises:
-        ValueError: An argument is missing, or what the constructor refuses.
+        ValueError: An argument is missing or unknown, or what the constructor refuses.
     """
     known: dict[str, Any] = {
         "gravity": task.given.get("gravity"),
@@ -167,12 +167,10 @@ def build(cls: type[Formulation], task: Task, **arguments: Any) -> Formulation:
         "given": dict(task.given),
         "positions": task.positions,
     }
-    asked = inspect.signature(cls.__init__).parameters
-    used = {name: value for name, value in known.items() if name in asked and value is not None} | arguments
-    missing = [name for name, each in asked.items() if each.kind is each.KEYWORD_ONLY and each.default is each.empty]
-    missing = [name for name in missing if name not in used]
-    if missing:
-        raise ValueError(
-            f"model: expected {', '.join(missing)} of {cls.__name__}, got {', '.join(arguments) or 'none'}"
-        )
-    return cls(**used)
+    signature = inspect.signature(cls.__init__)
+    known = {name: value for name, value in known.items() if name in signature.parameters and value is not None}
+    try:
+        signature.bind(None, **known | arguments)
+    except TypeError as error:
+        raise ValueError(f"model: {cls.__name__}: {error}") from None
+    return cls(**known | arguments)

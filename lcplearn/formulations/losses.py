@@ -22,11 +22,12 @@ def loss_terms(model: Formulation, windows: Windows, weights: Mapping[str, float
     pose:             robust distance of positions over all steps of the window [m], see `Formulation.pose_error`
     complementarity:  (friction * (v+, v-))^2, `direct` and `slack` only
     nonnegativity:    max(0, -(v+, v-))^2, `direct` and `slack` only
-    violation:        how badly the best friction explains a measured step, `structured` and scenes that say so
+    violation:        how badly the best friction explains a measured step: of the first one `structured`, of all scenes
+                      that say so
 
     Args:
         model: The formulation to judge.
-        windows: Measured windows; only `rollout` looks beyond the first step.
+        windows: Measured windows; `rollout`, `pose` and a scene's `violation` look beyond the first step.
         weights: Weight of each term, by name; missing terms have weight zero.
 
     Returns:

@@ -1,8 +1,11 @@
 """What happens beside the optimisation: reports, early stopping, a clean stop on Ctrl-C."""
 
 import math
+import multiprocessing
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -62,6 +65,11 @@ class EarlyStop(EarlyStopping):
 
     def __init__(self, monitor: str, patience: int) -> None:
         super().__init__(monitor, patience=patience, check_on_train_epoch_end=False)
+        self.comparable = True  # the errors of a resumed training, with those on the data of this one
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if self.comparable:
+            super().load_state_dict(state_dict)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: FormulationModule) -> None:  # type: ignore[override]
         optimizer, epoch = pl_module.optimizer, trainer.current_epoch
@@ -131,8 +139,11 @@ class BestCheckpoint(ModelCheckpoint):
     def __init__(self, folder: Path, monitor: str, resumed: str | Path | None = None) -> None:
         super().__init__(folder, "best", monitor=monitor, enable_version_counter=False, save_on_train_epoch_end=False)
         self.resumed = resumed
+        self.comparable = True  # the error of the best model so far, with those on the data of this training
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if not self.comparable:
+            return
         beside = Path(self.resumed or "").with_name("best.ckpt")  # the folder may have been moved since
         before = next((path for path in (beside, Path(state_dict["best_model_path"])) if path.is_file()), None)
         if before is None or self.dirpath is None:
@@ -190,33 +201,46 @@ class LastCheckpoint(pl.Callback):
     """
 
     def __init__(self, path: Path, every: int) -> None:
-        self.path, self.every, self.stopped = path, every, False
+        self.path, self.every = path, every
+        self._asked = multiprocessing.Value("b", 0, lock=False)  # shared with the processes of strategy=ddp_fork
         self._previous: dict[int, Any] = {}
 
+    @property
+    def stopped(self) -> bool:
+        """Whether a signal has come, to this process or to one that it forked."""
+        return bool(self._asked.value)
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Within, signals end the training; processes that are forked within listen, too."""
+        self._listen()
+        try:
+            yield
+        finally:
+            self._restore()
+
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if threading.current_thread() is threading.main_thread():
-            self._previous = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._listen()  # again: Lightning has put its own handler of SIGTERM before ours
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        stop = self.stopped
         if trainer.world_size > 1:  # a process that stops alone leaves the others waiting
-            self.stopped = trainer.strategy.reduce_boolean_decision(self.stopped, all=False)
+            stop = trainer.strategy.reduce_boolean_decision(stop, all=False)
         done = trainer.current_epoch + 1
-        trainer.should_stop = trainer.should_stop or self.stopped
         enough = done == trainer.max_epochs or 0 <= trainer.max_steps <= trainer.global_step
+        trainer.should_stop = trainer.should_stop or stop
         if trainer.should_stop or enough or done % self.every == 0:
             trainer.save_checkpoint(self.path, weights_only=False)
 
-    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
-        self._restore()
-
-    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        self._restore()
-
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        self.stopped = True
+        self._asked.value = 1
         self._restore()
+
+    def _listen(self) -> None:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous.setdefault(number, signal.signal(number, self._stop))
 
     def _restore(self) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
-        self._previous = {}

@@ -78,7 +78,7 @@ def fit(
         model: What to train; its parameters are changed in place.
         data: Recordings to learn from.
         loss: Weights of the loss terms; {"prediction": 1.0} by default.
-        horizon: Steps of a training window; only the rollout loss uses more than one.
+        horizon: Steps of a training window; rollout and pose use more than one.
         stages: What comes before, each with its epochs and what differs: lr, a shorter horizon, weights of loss terms.
         epochs: Epochs to train at most, those of stages included.
         batch_size: Windows in a batch; None for the full batch, which is best for these small models.
@@ -124,12 +124,16 @@ def fit(
     stop = [] if patience is None else [EarlyStop(module.monitor, patience=patience)]
     lightning = build_trainer(chosen, folder, [Divergence(folder), best, last, Report(data), *stop], logger)
     seconds, resumed = _resumed(ckpt_path, module, epochs, allow_changes=allow_changes)
+    best.comparable = "data.recordings" not in resumed.get("resumed", {}).get("changed", {})
+    for callback in stop:
+        callback.comparable = best.comparable
     if lightning.is_global_zero:
         rest = {"loss": loss, "horizon": horizon, "epochs": epochs, "patience": patience}
         rest["trainer"] = {key: setting(value) for key, value in (trainer or {}).items()}
         write_config(folder, {**(settings or {"model": described_model(model), **used, **rest}), **resumed})
-    seconds += run(lightning, module, loader, validation, folder, ckpt_path)
-    if last.stopped and lightning.current_epoch < epochs:  # in the last epoch a signal comes too late
+    with last.listening():
+        seconds += run(lightning, module, loader, validation, folder, ckpt_path)
+    if last.stopped and read(last.path)["epoch"] + 1 < epochs:  # in the last epoch a signal comes too late
         raise TrainingInterrupted(last.path)
     trained, error = _best(module, best)
     if not lightning.is_global_zero:

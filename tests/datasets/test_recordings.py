@@ -47,6 +47,7 @@ def test_a_true_number_may_be_0(tmp_path: Path) -> None:
         ({"steps": np.array([1.0, 2.0])}, r"steps: expected integers of shape \[2\], got float64"),
         ({"steps": np.array([0, 4])}, "steps: expected numbers from 1 to 3"),
         ({"dt": 0.0}, "dt: expected a positive number, got 0.0"),
+        ({"true_positions": np.zeros((2, 4))}, "true_velocities: expected beside true_positions, got none"),
         ({"mu": np.ones(2)}, "mu: expected a finite number"),
     ],
 )

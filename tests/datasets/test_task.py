@@ -1,12 +1,9 @@
 """Hand-made data are compared with their space, and what is wrong is named."""
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 import torch
 
-from lcplearn.datasets import Recordings, Task, read_recordings
+from lcplearn.datasets import Recordings, Task
 from lcplearn.scenes import LINE, Drive
 from lcplearn.scenes.space import POSE
 
@@ -52,10 +49,3 @@ def test_a_quaternion_that_is_no_rotation_is_refused() -> None:
     states[0, 1, 3:7] = 0.0
     with pytest.raises(ValueError, match=r"^train\.states: expected a quaternion of norm 1, got one of norm 0"):
         Task("mine", POSE, 0.1, still, still, still)
-
-
-def test_true_positions_without_true_velocities_are_no_truth(tmp_path: Path) -> None:
-    rows = np.zeros((2, 4))
-    np.savez(tmp_path / "mine.npz", dt=0.1, forces=rows[:, 1:], positions=rows, velocities=rows, true_positions=rows)
-    with pytest.raises(ValueError, match="true_velocities: expected beside true_positions, got none"):
-        read_recordings(tmp_path / "mine.npz")

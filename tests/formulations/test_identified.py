@@ -14,7 +14,7 @@ import lcplearn
 from lcplearn.datasets import Recordings, Task, simulate_sliding_block, windows
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.domains import NOT_NEGATIVE, Domain
-from lcplearn.formulations import MLP, Formulation, Identified, Physical, build, loss_terms
+from lcplearn.formulations import MLP, Formulation, Identified, Physical, Slack, build, loss_terms
 from lcplearn.formulations.cube_corners import CubeCorners
 from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
 from lcplearn.scenes.scene import Mode, Moving
@@ -178,8 +178,10 @@ def test_models_without_structure_see_positions_where_motion_depends_on_them() -
 
 def test_a_model_and_data_that_lack_a_number_are_named() -> None:
     task = simulate_sliding_block(trajectories=1, length=2, long_length=2)
-    with pytest.raises(ValueError, match=r"^model: expected learn of Identified, got scene"):
+    with pytest.raises(ValueError, match=r"^model: Identified: missing a required.* argument: 'learn'"):
         build(Identified, task, scene=SlidingBlock)
+    with pytest.raises(ValueError, match=r"^model: Slack: got an unexpected keyword argument 'width'"):
+        build(Slack, task, width=3)
     with pytest.raises(ValueError, match=r"^given: expected the half_width of a cube, got gravity"):
         build(CubeCorners, task, learn={"mu": 0.1})
 

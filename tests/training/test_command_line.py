@@ -87,6 +87,19 @@ def test_a_folder_without_a_run_goes_and_latest_is_the_last_with_one() -> None:
     assert Path("runs/latest/mine").is_file()
 
 
+def test_a_disk_without_links_takes_no_run_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = prepare([], CONF).folder
+    assert folder is not None
+    (folder / "last.ckpt").touch()
+
+    def refuse(*arguments: object) -> None:
+        raise OSError("links are not supported")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    settle(folder)
+    assert (folder / "last.ckpt").is_file()
+
+
 def test_nothing_here_imports_torch() -> None:
     code = "import sys, lcplearn.command_line; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

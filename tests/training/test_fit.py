@@ -201,6 +201,16 @@ def test_the_best_model_before_an_interruption_stays_the_best_after_it(tmp_path:
     assert all(torch.equal(value, first[f"model.{name}"]) for name, value in result.model.state_dict().items())
 
 
+def test_a_training_resumed_with_other_data_has_no_best_model_yet(tmp_path: Path) -> None:
+    """Its error on data without noise would never be reached again."""
+    clean, noisy = tiny_data(), tiny_data(noise=0.3)
+    short_fit(Physical(dt=clean.dt), clean, tmp_path / "first", epochs=40, optimizer=Optimizer(lbfgs_after=20))
+    result = short_fit(Physical(dt=clean.dt), noisy, tmp_path / "second", epochs=42, allow_changes=True, patience=1,
+                       optimizer=Optimizer(lbfgs_after=20), ckpt_path=tmp_path / "first" / "last.ckpt")  # fmt: skip
+    assert result.validation > 0.01
+    assert torch.load(tmp_path / "second" / "best.ckpt")["epoch"] > last_epoch(tmp_path / "first")
+
+
 def test_equal_seeds_give_equal_parameters_and_others_do_not(tmp_path: Path) -> None:
     data = tiny_data()
     found = []

@@ -50,9 +50,10 @@ def test_a_sweep_over_two_processes_each_trains_as_one_would_and_ends_with_the_c
     assert not noise, noise  # no adverts and no warnings
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_the_command_that_goes_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize("processes", [[], ["trainer.strategy=ddp_fork", "trainer.devices=2"]])
+def test_ctrl_c_leaves_a_checkpoint_and_the_command_that_goes_on(processes: list[str], tmp_path: Path) -> None:
     command = [sys.executable, "-u", str(ROOT / "train.py"), "model=physical", "trainer.max_epochs=5000",
-               "optimizer=adam", "patience=null", *SMALL]  # fmt: skip
+               "optimizer=adam", "patience=null", *processes, *SMALL]  # fmt: skip
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     while "val/rollout_rmse" not in process.stderr.read(80):
