@@ -141,14 +141,21 @@ def contact_step(
     """
     problem, batch = _flatten(contacts, free, mass, dt)
     kernel = None if polygon is not None else compiled_contacts(free.device)
-    found, at_rest = solve(problem, polygon, rest) if kernel is None else kernel.solve(problem, rest)
+    step = _in_torch(problem, polygon, rest) if kernel is None else kernel.solve(problem, rest)
+    if len(batch) != 1:
+        step = ContactStep(*(x.reshape((*batch, *x.shape[1:])) for x in step))
+    if free.dtype is not torch.float64:
+        step = ContactStep(*(x.to(free.dtype) for x in step[:3]), *step[3:])
+    return step
+
+
+def _in_torch(problem: Problem, polygon: int | None, rest: bool) -> ContactStep:
+    found, at_rest = solve(problem, polygon, rest)
     # The value is exactly 0, and the gradient that of the computed velocity.
     velocity = torch.where(at_rest.unsqueeze(-1), found.velocity - found.velocity.detach(), found.velocity)
     slips = torch.where(found.sticks | at_rest.unsqueeze(-1), int(Mode.STICK), int(Mode.SLIP))
     mode = torch.where(found.normal > 0.0, slips, int(Mode.SEPARATION))
-    numbers = (x.to(free.dtype) for x in (velocity, found.normal, found.friction))
-    parts = (*numbers, mode, at_rest, found.solved, found.settled)
-    return ContactStep(*(x.reshape((*batch, *x.shape[1:])) for x in parts))
+    return ContactStep(velocity, found.normal, found.friction, mode, at_rest, found.solved, found.settled)
 
 
 def compiled_contacts(device: torch.device) -> ModuleType | None:

@@ -12,7 +12,6 @@ from lcplearn.scenes.contact_kernel.compiling import call, compiled, fingerprint
 from lcplearn.scenes.contact_kernel.steps import contacts_address
 
 SMALL = 1e-8  # squared half angle below which series are exact; as in space.py
-STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
 
 
 @compiled
@@ -111,7 +110,7 @@ def _make_roll(sources: str) -> Any:
         target, friction_mu, soft = np.empty((1, C)), np.empty((1, C)), np.empty((1, C))
         load, friction, sticks = np.empty((1, C)), np.empty((1, C, 2)), np.empty((1, C), np.bool_)
         free_now, mass_now, v_now = np.empty((1, 6)), np.empty((1, 6)), np.empty((1, 6))
-        flags = np.empty((1, 3), np.bool_)
+        mode, flags = np.empty((1, C), np.int64), np.empty((1, 3), np.bool_)
         free, v = free_now[0], v_now[0]
         R, q, gap, closing = np.empty((3, 3)), np.empty(4), np.empty(C), np.empty(C)
         for b in range(B):
@@ -146,23 +145,19 @@ def _make_roll(sources: str) -> Any:
                     contacts,
                     (
                         address, rest, target, normal, tangents, friction_mu, soft, free_now, mass_now, v_now, load,
-                        friction, sticks, flags,
+                        friction, mode, sticks, flags,
                     ),
                 )  # fmt: skip
                 at_rest = flags[0, 2]
                 solved[b, t] = flags[0, 0] and flags[0, 1]
-                for i in range(C):
-                    modes[b, t, i] = SEPARATION
-                    if load[0, i] > 0.0:
-                        modes[b, t, i] = STICK if at_rest or sticks[0, i] else SLIP
+                modes[b, t] = mode[0]
                 if len(loads):  # somebody will ask for the gradient
                     loads[b, t], frictions[b, t], sticking[b, t] = load[0], friction[0], sticks[0]
-                for k in range(6):
-                    after[7 + k] = 0.0 if at_rest else v[k]
-                if not at_rest:
+                if not at_rest:  # else a quaternion could change its last bit
                     _turn(q, v[3:], dt)
+                after[7:] = v
                 for i in range(3):
-                    after[i] = x[i] + (0.0 if at_rest else dt * v[i])
+                    after[i] = x[i] + dt * v[i]
                 for i in range(4):
                     after[3 + i] = q[i]
 

@@ -1,7 +1,6 @@
 """Contacts: every solution is held against Coulomb's law over all contacts, against enumeration and differences."""
 
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,10 +12,16 @@ from real_data import real_data
 from scenes.contact_scenes import DT, boxes, polygons, resting_boxes, violation
 from torch import Tensor
 
-from lcplearn.scenes.contact import Contacts, _flatten, closing_speed, compiled_contacts, contact_step, rebound
+from lcplearn.scenes.contact import (
+    Contacts,
+    ContactStep,
+    _flatten,
+    closing_speed,
+    compiled_contacts,
+    contact_step,
+    rebound,
+)
 from lcplearn.scenes.contact_solve import _iterate, find
-from lcplearn.scenes.contact_solve import solve as solve_in_torch
-from lcplearn.scenes.friction_lcp import Answer, Problem
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -287,30 +292,30 @@ def test_three_friction_directions_are_refused():
 
 @pytest.mark.parametrize("compliance", [0.0, 1e-3])
 @pytest.mark.parametrize("scene", [polygons, boxes])
-def test_the_compiled_step_and_its_gradient_are_those_of_torch(scene, compliance):
+def test_the_compiled_step_and_its_gradient_are_those_of_torch(scene, compliance, monkeypatch):
     pytest.importorskip("numba")
     contacts, free, mass = scene(60, 11)
     contacts = contacts._replace(compliance=torch.full_like(contacts.gap, compliance))
-    problem, _ = _flatten(contacts, free, mass, DT)
     draw = torch.Generator().manual_seed(1)
     weights = torch.randn(free.shape, generator=draw), torch.randn(contacts.tangents.shape[:-1], generator=draw)
 
-    def both(solve: Callable) -> tuple[Answer, Tensor, list[Tensor]]:
-        inputs = Problem(*(x.clone().requires_grad_() for x in problem))
-        answer, at_rest = solve(inputs)
-        loss = (weights[0] * answer.velocity).sum()
+    def both(kernel: object) -> tuple[ContactStep, list[Tensor]]:
+        monkeypatch.setattr("lcplearn.scenes.contact.compiled_contacts", lambda device: kernel)
+        inputs = [x.clone().requires_grad_() for x in (*contacts, free, mass)]
+        step = contact_step(Contacts(*inputs[:6]), inputs[6], inputs[7], DT)
+        loss = (weights[0] * step.velocity).sum()
         if compliance:  # else loads are not unique, nor what friction of each contact
-            loss = loss + (weights[1] * answer.friction).sum() + answer.normal.square().sum()
-        return answer, at_rest, list(torch.autograd.grad(loss, inputs))
+            loss = loss + (weights[1] * step.friction_impulse).sum() + step.normal_impulse.square().sum()
+        return step, list(torch.autograd.grad(loss, inputs))
 
-    kernel = compiled_contacts(torch.device("cpu"))
-    compiled, compiled_rest, gradients = both(lambda inputs: kernel.solve(inputs, True))
-    found, at_rest, expected = both(lambda inputs: solve_in_torch(inputs, None, True))
+    compiled, gradients = both(compiled_contacts(torch.device("cpu")))
+    found, expected = both(None)
     assert (compiled.solved & compiled.settled & found.solved & found.settled).all()
-    assert (compiled_rest == at_rest).all()
+    assert (compiled.at_rest == found.at_rest).all()
     torch.testing.assert_close(compiled.velocity, found.velocity, rtol=0, atol=1e-12)
     if compliance:
-        torch.testing.assert_close(compiled.normal, found.normal, rtol=0, atol=1e-11)
+        torch.testing.assert_close(compiled.normal_impulse, found.normal_impulse, rtol=0, atol=1e-11)
+        assert (compiled.mode == found.mode).all()
     close = 1e-9 if compliance else 1e-11  # a small compliance makes loads unique, and sensitive
     for mine, wanted in zip(gradients, expected, strict=True):
         torch.testing.assert_close(mine, wanted, rtol=0, atol=close * float(1.0 + wanted.abs().amax()))

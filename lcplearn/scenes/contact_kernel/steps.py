@@ -1,5 +1,6 @@
 """A batch of contact problems, compiled: their solution and its gradient as one node of autograd."""
 
+from collections.abc import Iterable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lcplearn.scenes.contact import ContactStep
 from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
 from lcplearn.scenes.contact_kernel.compiling import (
     address_of,
@@ -17,13 +19,16 @@ from lcplearn.scenes.contact_kernel.compiling import (
 )
 from lcplearn.scenes.contact_kernel.cone import workspace
 from lcplearn.scenes.contact_kernel.element import parts, solve_element
-from lcplearn.scenes.friction_lcp import Answer, Problem
+from lcplearn.scenes.friction_lcp import Problem
+
+STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
 
 
 def _make_solve_all(sources: str) -> Any:
     def _solve_all(
-        address, rest, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, sticks, flags
-    ):
+        address, rest, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, modes, sticks,
+        flags,
+    ):  # fmt: skip
         sources  # noqa: B018, for the cache
         B, C, nv = normal.shape
         T = tangents.shape[2]
@@ -35,6 +40,13 @@ def _make_solve_all(sources: str) -> Any:
                 address, C, nv, T, rest, target[b], normal[b], tangents[b], mu[b], compliance[b], free[b], mass[b],
                 numbers, part, rows, index, active, gram, scale, velocity[b], load[b], friction[b], sticks[b],
             )  # fmt: skip
+            at_rest = flags[b, 2]
+            if at_rest:
+                velocity[b] = 0.0
+            for i in range(C):
+                modes[b, i] = SEPARATION
+                if load[b, i] > 0.0:
+                    modes[b, i] = STICK if at_rest or sticks[b, i] else SLIP
 
     return compiled(_solve_all, cached=True)
 
@@ -89,38 +101,40 @@ _pull_back_all = _make_pull_back_all(fingerprint("contact_gradient.py"))
 @cache
 def contacts_address() -> int:
     """Where the compiled solver of contacts is; called as `_solve_all` is."""
-    one, row, rows, flags = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1)), np.ones((1, 1), np.bool_)
+    one, row, rows = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
+    modes, flags = np.ones((1, 1), np.int64), np.ones((1, 1), np.bool_)
     return address_of(
-        _solve_all, solver_address(), True, one, row, rows, one, one, one, one, one, one, row, flags, flags
+        _solve_all, solver_address(), True, one, row, rows, one, one, one, one, one, one, row, modes, flags, flags
     )  # fmt: skip
 
 
 class Solved(NamedTuple):
-    """Numpy arrays of what is found; flags [B, 3] are solved, settled, at rest. Other shapes as in `Answer`."""
+    """Numpy arrays of what is found; flags [B, 3] are solved, settled, at rest. Other shapes as in `ContactStep`."""
 
     velocity: np.ndarray
     load: np.ndarray
     friction: np.ndarray
+    modes: np.ndarray
     sticks: np.ndarray
     flags: np.ndarray
 
 
-def solve(problem: Problem, rest: bool) -> tuple[Answer, Tensor]:
-    """The answer, differentiable, and where it is at rest; its slip is not told."""
+def solve(problem: Problem, rest: bool) -> ContactStep:
+    """The step of a batch, differentiable."""
     if torch.is_grad_enabled() and any(x.requires_grad for x in problem):
-        velocity, load, friction, sticks, flags = _Contacts.apply(rest, *problem)
+        velocity, load, friction, modes, _, flags = _Contacts.apply(rest, *problem)
     else:
-        velocity, load, friction, sticks, flags = (torch.from_numpy(x) for x in _solve(problem, rest))
+        velocity, load, friction, modes, _, flags = map(torch.from_numpy, _solve(problem, rest))
     solved, settled, at_rest = flags.unbind(-1)
-    return Answer(velocity, load, friction, friction, sticks, solved, settled), at_rest
+    return ContactStep(velocity, load, friction, modes, at_rest, solved, settled)
 
 
-def _solve(problem: Problem, rest: bool) -> Solved:
+def _solve(problem: Iterable[Tensor], rest: bool) -> Solved:
     arrays = [x.detach().contiguous().numpy() for x in problem]
     target, _, tangents, *_, free, _ = arrays
     found = Solved(
-        np.empty_like(free), np.empty_like(target), np.empty(tangents.shape[:3]), np.empty(target.shape, np.bool_),
-        np.empty((len(free), 3), np.bool_),
+        np.empty_like(free), np.empty_like(target), np.empty(tangents.shape[:3]), np.empty(target.shape, np.int64),
+        np.empty(target.shape, np.bool_), np.empty((len(free), 3), np.bool_),
     )  # fmt: skip
     _solve_all(solver_address(), rest, *arrays, *found)
     return found
@@ -129,10 +143,10 @@ def _solve(problem: Problem, rest: bool) -> Solved:
 class _Contacts(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rest: bool, *problem: Tensor) -> tuple[Tensor, ...]:
-        results = tuple(torch.from_numpy(x) for x in _solve(Problem(*problem), rest))
-        ctx.save_for_backward(*problem, *results[1:])
-        ctx.mark_non_differentiable(*results[3:])
-        return results
+        velocity, load, friction, *told = map(torch.from_numpy, _solve(problem, rest))
+        ctx.save_for_backward(*problem, load, friction, *told[1:])
+        ctx.mark_non_differentiable(*told)
+        return velocity, load, friction, *told
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -143,4 +157,5 @@ class _Contacts(torch.autograd.Function):
         results = [np.zeros(x.shape) for x in given]
         wanted = [x.contiguous().numpy() for x in gradients[:3]]
         _pull_back_all(*given[1:], *found, *wanted, *results)
-        return (None, *(torch.from_numpy(x) for x in results))
+        wants = ctx.needs_input_grad[1:]
+        return (None, *(torch.from_numpy(x) if want else None for x, want in zip(results, wants, strict=True)))
