@@ -75,7 +75,7 @@ def read_runs(folders: Iterable[str | Path]) -> list[Row]:
     groups: dict[str, list[int]] = {}
     for index, label in enumerate(_labels(configs)):
         groups.setdefault(label, []).append(index)
-    metrics = [_read(path / "metrics.json", json.loads) for path in paths]
+    metrics = [_figures(path / "metrics.json") for path in paths]
     rows = [
         _row(label, [configs[index] for index in group], [metrics[index] for index in group])
         for label, group in groups.items()
@@ -182,6 +182,18 @@ def _read(path: Path, parse: Any) -> dict[str, Any]:
     return values
 
 
+def _figures(path: Path) -> dict[str, Any]:
+    """Figures of metrics.json, in which what is not finite is the word "diverged"; the sentence on it stays."""
+    figures = _read(path, json.loads)
+    for key, value in figures.items():
+        if key == "diverged":
+            continue
+        figures[key] = math.inf if value == "diverged" else value
+        if not isinstance(figures[key], float | int | None):
+            raise ValueError(f'{path}: {key}: expected a number, null or "diverged", got {value!r}')
+    return figures
+
+
 def _labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Name of the model's class, and whatever else differs."""
     settings = [flat(config) for config in configs]
@@ -211,7 +223,7 @@ def _row(label: str, configs: Sequence[Mapping[str, Any]], runs: Sequence[Mappin
     values: dict[str, Value] = {}
     extremes = {}
     for key in in_order((*KEYS, *(key for run in runs for key in run if key != "diverged"))):
-        found = [_figure(run.get(key)) for run in runs]
+        found = [run.get(key) for run in runs]
         if all(value is None for value in found):
             values[key] = None
             continue
@@ -224,11 +236,6 @@ def _row(label: str, configs: Sequence[Mapping[str, Any]], runs: Sequence[Mappin
         values[key], extremes[key] = (statistics.median if finite else middle)(counted), (min(counted), max(counted))
     seeds = {config.get("seed") for config in configs}
     return Row(label, len(runs), len(seeds), sum("diverged" in run for run in runs), values, extremes)
-
-
-def _figure(value: Any) -> Value:
-    """A figure of metrics.json, where what is not finite is the word "diverged"."""
-    return math.inf if value == "diverged" else value
 
 
 def _error(row: Row) -> float:

@@ -96,7 +96,7 @@ def load(path: str | Path, map_location: str | torch.device | None = None, *, tr
             arguments.pop("gravity", None)  # in version 0.1 they took it, without a use for it
         model = cls(**arguments)
         model.load_state_dict(state)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, KeyError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path} was made with another version of {module}.{name}: {reason}") from error
     return model.to(map_location).eval() if map_location is not None else model.eval()

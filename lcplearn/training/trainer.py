@@ -54,7 +54,7 @@ def build(chosen: Mapping[str, Any], folder: Path, callbacks: Sequence[pl.Callba
         callbacks.append(EpochBar())
     plugins = rest.pop("plugins", None) or []
     plugins = [AtomicCheckpointIO(), *(plugins if isinstance(plugins, list | tuple) else [plugins])]
-    with _errors():
+    with _errors(TypeError):  # of devices=x, for instance
         return pl.Trainer(
             default_root_dir=folder, callbacks=callbacks, logger=logger or False, plugins=plugins,
             num_sanity_val_steps=0, **rest,
@@ -108,9 +108,10 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def _errors() -> Iterator[None]:
+def _errors(*more: type[Exception]) -> Iterator[None]:
     """Settings that Lightning refuses, such as a device that isn't there, are the caller's mistake."""
+    refused: tuple[type[Exception], ...] = (MisconfigurationException, *more)
     try:
         yield
-    except MisconfigurationException as error:
+    except refused as error:
         raise ValueError(f"Lightning's Trainer can't use these settings: {' '.join(str(error).split())}") from error

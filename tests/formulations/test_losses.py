@@ -7,14 +7,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lcplearn.datasets import Windows
-from lcplearn.formulations import FORMULATIONS, Direct, Formulation, Physical, loss_terms
-from lcplearn.scenes import Drive
+from lcplearn.formulations import FORMULATIONS, MLP, Direct, Formulation, Physical, loss_terms
+from lcplearn.scenes import PLANE, Drive
 from lcplearn.scenes.violation import VIOLATION_WIDTH, violation
 
 DT, GRAVITY = 0.1, 10.0
 MODELS_OF = {
     "prediction": set(FORMULATIONS),
     "rollout": set(FORMULATIONS),
+    "pose": set(FORMULATIONS),
     "complementarity": {"direct", "slack"},
     "nonnegativity": {"direct", "slack"},
     "violation": {"structured", "physical"},
@@ -86,6 +87,25 @@ def test_prediction_and_rollout_equal_values_worked_out_by_hand() -> None:
     terms = loss_terms(model, windows, {"prediction": 1.0, "rollout": 1.0})
     assert terms["prediction"].item() == pytest.approx(0.2**2)
     assert terms["rollout"].item() == pytest.approx((0.2**2 + 0.5**2) / 2)
+
+
+def test_the_pose_error_is_a_robust_distance_that_weighs_rotations_by_the_radius() -> None:
+    """c (sqrt(1 + d^2 / c^2) - 1), c = radius / 10; a body that goes on moves by 0.03 m and turns by 0.2 rad."""
+    block = Physical(dt=DT, gravity=GRAVITY, initial_mu=0.4, initial_mass=2.0)
+    windows = line_windows(tensor(1.0, 0.8)[None], tensor(4.0)[None])  # recorded at 0, and 0.08 m from there
+    found = loss_terms(block, windows, {"pose": 1.0})["pose"]
+    assert found.item() == pytest.approx(0.1 * (1.64**0.5 - 1.0))
+    body = MLP(dt=DT, space=PLANE)
+    body.radius = 0.5
+    for parameter in body.parameters():
+        parameter.data.fill_(0.0)
+    still = torch.zeros(1, 2, 6, dtype=torch.float64)
+    still[..., 3:] = tensor(0.3, 0.0, 2.0)
+    turned = Windows(still, Drive(torch.zeros(1, 1, 3, dtype=torch.float64)), torch.ones(1, 1, dtype=torch.bool))
+    square = (0.03**2 + (0.5 * 0.2) ** 2) / 0.05**2
+    assert loss_terms(body, turned, {"pose": 1.0})["pose"].item() == pytest.approx(0.05 * ((1.0 + square) ** 0.5 - 1.0))
+    still[:, 1, 5] += 1.0  # recorded faster by 1 rad/s
+    assert loss_terms(body, turned, {"rollout": 1.0})["rollout"].item() == pytest.approx(0.5**2)
 
 
 def test_penalties_equal_values_worked_out_by_hand() -> None:

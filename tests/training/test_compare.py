@@ -106,6 +106,12 @@ def test_settings_that_are_no_yaml_get_one_sentence(tmp_path: Path) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_figures_that_are_no_numbers_get_one_sentence(tmp_path: Path) -> None:
+    run(tmp_path / "a", "baselines.MLP", velocity_rmse=[0.5])  # type: ignore[arg-type]
+    with pytest.raises(SystemExit, match=r"metrics\.json: velocity_rmse: expected a number, null or .* got \[0\.5\]"):
+        compare.main([str(tmp_path)])
+
+
 def test_the_table_holds_only_figures_that_a_run_has(tmp_path: Path) -> None:
     run(tmp_path / "a", "baselines.MLP", velocity_rmse=0.5, parameters=7)
     text = compare.format_table(compare.read_runs([tmp_path]))

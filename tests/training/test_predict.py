@@ -349,7 +349,8 @@ def test_a_checkpoint_that_names_another_class_is_not_built(checkpoint: Path, tm
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [({"arguments": {"dt": 0.05, "mass": 1.0}}, "unexpected keyword argument 'mass'"),
-     ({"class": "lcplearn.formulations.relu.ReLU"}, "Missing key")],
+     ({"class": "lcplearn.formulations.relu.ReLU"}, "Missing key"),
+     ({"class": "lcplearn.formulations.baselines.MLP", "arguments": {"space": {"positions": ["x"]}}}, "velocities")],
 )  # fmt: skip
 def test_a_checkpoint_of_a_class_that_has_changed_says_so(
     changed: dict[str, Any], reason: str, checkpoint: Path, tmp_path: Path
