@@ -4,8 +4,10 @@ A scene gives gaps, Jacobians and a free velocity; `contact_step` finds the velo
 for contacts that close, checks the others afterwards, and adds what it was wrong about. Nothing here knows of shapes.
 """
 
+from collections.abc import Callable
+from functools import wraps
 from types import ModuleType
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,6 +21,20 @@ from lcplearn.scenes.numbers import common_batch, one_batch
 from lcplearn.scenes.scene import Mode
 
 RestitutionLaw = Literal["newton", "continuous"]
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def outside_graphs(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """For what branches on data: torch.compile breaks its graph there, and the function runs as in eager code."""
+
+    @wraps(function)
+    def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if torch.compiler.is_compiling():  # asked first, since torch.compiler.disable imports the compiler
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return run
 
 
 class Contacts(NamedTuple):
@@ -106,6 +122,7 @@ def rebound(
     return torch.where(bounce > 0.0, torch.relu(bounce + gap / dt), 0.0)
 
 
+@outside_graphs
 def contact_step(
     contacts: Contacts,
     free: Float[Tensor, "*#batch nv"],

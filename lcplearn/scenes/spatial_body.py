@@ -10,7 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check, check_numbers
-from lcplearn.scenes.contact import Contacts, RestitutionLaw, closing_speed, compiled_contacts, contact_step, rebound
+from lcplearn.scenes.contact import (
+    Contacts,
+    RestitutionLaw,
+    closing_speed,
+    compiled_contacts,
+    contact_step,
+    outside_graphs,
+    rebound,
+)
 from lcplearn.scenes.contact_violation import Touch
 from lcplearn.scenes.numbers import Number, as_tensor, common_batch, matvec, one_batch, stack_numbers
 from lcplearn.scenes.scene import Drive, Step, Trajectory, rollout
@@ -119,6 +127,7 @@ class SpatialBody:
         found = self._fused(state, drive.force)
         return None if found is None else Trajectory(*POSE.split(found[0]), *found[1:])
 
+    @outside_graphs
     def _fused(self, state: Tensor, force: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         """States, modes and whether each step is right of a fused rollout of force [*batch, T, 6]."""
         if self.polygon is not None or compiled_contacts(state.device) is None:

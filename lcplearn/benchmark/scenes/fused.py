@@ -61,13 +61,17 @@ def fused_rows(what: str, batch: int, repeats: int, seed: int) -> list[Row]:
     return rows
 
 
-def _call(what: str, batch: int, seed: int, gradient: bool) -> Callable[[], Tensor]:
-    """Does it once; gives velocities, or the gradient with respect to free velocity or state."""
-    # a box that lies on a face, an edge or a corner, and slides: the first lies on a face
-    state = box_states(batch, seed)
+def a_box(batch: int, seed: int) -> tuple[SpatialBody, Tensor]:
+    """A box, and states in which it lies on a face, an edge or a corner and slides; in the first, on a face."""
     inertia = MASS / 3 * (HALF[0] ** 2 + HALF[2] ** 2)
     corners = box_corners(torch.tensor(HALF, dtype=torch.float64))
     body = SpatialBody(corners=corners, inertia=inertia, mu=MU, dt=DT, mass=MASS, compliance=COMPLIANCE)
+    return body, box_states(batch, seed)
+
+
+def _call(what: str, batch: int, seed: int, gradient: bool) -> Callable[[], Tensor]:
+    """Does it once; gives velocities, or the gradient with respect to free velocity or state."""
+    body, state = a_box(batch, seed)
     if what == "contact step":
         position, before = POSE.split(state)
         turn, mass = rotation_matrix(position[..., 3:]), body._mass(state)
@@ -80,14 +84,16 @@ def _call(what: str, batch: int, seed: int, gradient: bool) -> Callable[[], Tens
     else:
         start, nothing = state, Drive(torch.zeros(batch, STEPS, 6, dtype=torch.float64))
         step = lambda state: rollout(body, state, nothing).velocities[..., -1, :]  # noqa: E731
-    return partial(_pull, step, start) if gradient else partial(_push, step, start)
+    return partial(pull, step, start) if gradient else partial(push, step, start)
 
 
 @torch.no_grad()
-def _push(step: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
+def push(step: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
+    """A step without gradient."""
     return step(start)
 
 
-def _pull(step: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
+def pull(step: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
+    """The gradient of a sum over a step with respect to its start."""
     start = start.detach().requires_grad_()
     return torch.autograd.grad(step(start).sum(), start)[0]

@@ -19,6 +19,7 @@ from lcplearn.benchmark.scenes.cases import (
     random_states,
     start,
 )
+from lcplearn.benchmark.scenes.compiled import COMPILED, compiled_rows
 from lcplearn.benchmark.scenes.contact_cases import CURVED, DT, MU, body_rows, body_scenes, curve_rows
 from lcplearn.benchmark.scenes.figures import cone_bars, curve_lines, error_time, time_bars
 from lcplearn.benchmark.scenes.fused import WHAT, fused_rows
@@ -48,6 +49,8 @@ def run(options: Options) -> None:
             rows = body_rows(str(scene), int(batch), 3 if options.quick else 7, options.seed)
         elif part == "fused":
             rows = fused_rows(str(scene), int(batch), 3 if options.quick else 15, options.seed)
+        elif part == "compiled":
+            rows = compiled_rows(str(scene), int(batch), 3 if options.quick else 31)
         else:
             rows = curve_rows(float(dt), 1 if options.quick else 5)
         study.add(key, *rows)
@@ -63,6 +66,7 @@ def plan(quick: bool) -> Iterable[tuple[Any, ...]]:
         yield from (("body", scene, DT, batch) for batch in BODY_BATCHES[: 2 if quick else 3])
     for what in WHAT[:1] if quick else WHAT:
         yield from (("fused", what, DT, batch) for batch in FUSED_BATCHES)
+    yield from (("compiled", scene, DT, 1) for scene in (() if quick else COMPILED))
     yield from (("curve", CURVED.name, dt, 1) for dt in STEP_SIZES[: 7 if quick else 10 : 2 if quick else 1])
 
 
@@ -70,7 +74,7 @@ def expected_seconds(part: Any, scene: Any, dt: Any, batch: Any) -> float:
     """Rough cost of a key of the full run."""
     if part == "body":
         return 2.0 + 5e-3 * float(batch)
-    if part == "fused":
+    if part in ("fused", "compiled"):
         return 20.0
     if part == "curve":
         return 24 * 1e-4 * CURVED.duration / float(dt)
@@ -227,6 +231,18 @@ def _say_bodies(study: Study) -> None:
               r["velocity_difference"]) for r in fused],
         ),
     )  # fmt: skip
+    compiled = [row for row in study.rows if row["part"] == "compiled"]
+    if compiled:
+        study.say(
+            "What does torch.compile gain in a step?",
+            "A step of one body: CPU time, eager and compiled, the largest difference of states or gradients, and how "
+            "long compilation took. The contacts of a box are a break between two graphs.",
+            table=Table(
+                ("scene", "", "compiled [us]", "eager [us]", "eager / compiled", "difference", "compilation [s]"),
+                [(r["scene"], r["formulation"], r["step_us"], r["torch_us"], r["full_over_this"],
+                  r["velocity_difference"], r["seconds"]) for r in compiled],
+            ),
+        )  # fmt: skip
     curves = [row for row in study.rows if row["part"] == "curve"]
     study.say(
         "Which step size and friction for a slide that curves?",
