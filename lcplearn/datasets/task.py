@@ -88,6 +88,8 @@ def check_recordings(name: str, part: Recordings, space: Space) -> None:
             raise ValueError(f"{name}.{field_name}: expected shape {list(shape)}, got {list(tensor.shape)}")
         if tensor is not None and field_name != "steps" and tensor.dtype != torch.float64:
             raise ValueError(f"{name}.{field_name}: expected float64, got {tensor.dtype}")
+    if part.steps.is_floating_point():
+        raise ValueError(f"{name}.steps: expected integers, got {part.steps.dtype}")
     if not bool(((part.steps >= 1) & (part.steps <= steps)).all()):
         raise ValueError(f"{name}.steps: expected numbers from 1 to {steps}, got {part.steps.tolist()}")
     valid = part.valid

@@ -91,7 +91,9 @@ class Identified(Formulation):
 
     def _scene(self, learned: Mapping[str, Tensor]) -> Scene:
         softened = {"temperature": self.temperature} if self.temperature and self.softens else {}
-        scene: Scene = self.scene_type(dt=self.dt, **{**self.fixed, **learned, **softened})
+        device = next(iter(learned.values())).device
+        fixed = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in self.fixed.items()}
+        scene: Scene = self.scene_type(dt=self.dt, **{**fixed, **learned, **softened})
         return scene
 
     def moving_each(self, count: int) -> Scene:

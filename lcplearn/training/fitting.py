@@ -15,7 +15,8 @@ from lcplearn.scenes.space import Space
 from lcplearn.training.asked import described_data, described_model, hyperparameters, setting, taken, write_config
 from lcplearn.training.callbacks import BestCheckpoint, Divergence, EarlyStop, LastCheckpoint, Report
 from lcplearn.training.checkpoint import check_resumable, plain, read
-from lcplearn.training.module import FormulationModule
+from lcplearn.training.metrics import JUDGES
+from lcplearn.training.module import VALIDATION, FormulationModule
 from lcplearn.training.optimizer import Optimizer
 from lcplearn.training.results import leave
 from lcplearn.training.settings import flat
@@ -165,7 +166,11 @@ def _best(module: FormulationModule, best: BestCheckpoint) -> tuple[Formulation,
 
 
 def _check_agreement(model: Formulation, data: Task) -> None:
-    """A model of another time step, space or gravity would learn, but something else."""
+    """A model of another time step, space or gravity would learn, but something else; judges are asked at the end."""
+    for name, known, asked in (("judged_by", JUDGES, data.judged_by), ("chosen_by", VALIDATION, (data.chosen_by,))):
+        for each in asked:
+            if each not in known:
+                raise ValueError(f"data.{name}: expected one of {', '.join(known)}, got {each!r}")
     ours = {"dt": model.dt, "space": model.space, **model.given}
     theirs = {"dt": data.dt, "space": data.space, **data.given}
     for name in sorted(ours.keys() & theirs.keys()):

@@ -42,6 +42,13 @@ def test_states_that_are_not_finite_and_a_wrong_time_step_are_refused() -> None:
         Task("mine", LINE, 0.0, part(), part(), part())
 
 
+def test_lengths_are_whole_numbers() -> None:
+    half = part()._replace(steps=torch.tensor([2.5, 2.0]))
+    # the check of types is first where the tests check types
+    with pytest.raises((ValueError, TypeError), match="steps"):
+        Task("mine", LINE, 0.1, half, part(), part())
+
+
 def test_a_quaternion_that_is_no_rotation_is_refused() -> None:
     states = POSE.origin().repeat(1, 3, 1)
     still = Recordings(states, Drive(torch.zeros(1, 2, 6, dtype=torch.float64)), torch.tensor([2]))

@@ -17,6 +17,7 @@ from lcplearn.domains import NOT_NEGATIVE, Domain
 from lcplearn.formulations import MLP, Formulation, Identified, Physical, Slack, build, loss_terms
 from lcplearn.formulations.cube_corners import CubeCorners
 from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
+from lcplearn.scenes.planar_body import PlanarBody, rectangle
 from lcplearn.scenes.scene import Mode, Moving
 from lcplearn.scenes.space import Space
 from lcplearn.scenes.spring_block import SpringBlock
@@ -196,6 +197,13 @@ def test_a_threshold_is_softened_where_the_scene_has_one_and_left_alone_elsewher
         exact = model.rollout_error(found)
         with model.softened(1.0):
             assert torch.equal(model.rollout_error(found), exact) != softer
+
+
+def test_what_is_given_goes_to_the_device_of_what_is_learned() -> None:
+    corners = rectangle(0.06, 0.04).tolist()
+    model = Identified(scene=PlanarBody, dt=0.01, learn={"mu": 0.5}, given={"inertia": 7e-4, "corners": corners})
+    for scene in (model.to("meta").moving(), model.moving_each(3)):
+        assert scene.corners.device.type == "meta"  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("term", ["prediction", "rollout"])

@@ -246,6 +246,14 @@ def test_a_loss_that_the_model_does_not_have_is_refused_before_training(tmp_path
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(("name", "value"), [("judged_by", ("one_step", "stop")), ("chosen_by", "poses")])
+def test_a_judge_that_nobody_knows_is_refused_before_training(name: str, value: Any, tmp_path: Path) -> None:
+    data = dataclasses.replace(tiny_data(), **{name: value})
+    with pytest.raises(ValueError, match=rf"^data\.{name}: expected one of .*, got '(stop|poses)'"):
+        short_fit(Physical(dt=data.dt), data, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_device_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
     data = tiny_data()
     for devices in (0, "x"):
