@@ -1,5 +1,6 @@
 """Pictures of pushes: where they ended and where a model says, and its error by configuration."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,12 +36,12 @@ def draw_pushes(model: PushModel, data: PushData, prediction: PushPrediction, co
         own = (data.configuration == k).nonzero()[:, 0]
         rows.append(int(own[deviation[own].argsort()[len(own) // 2]]))
     figure = _figure((4.2 * 3, 4.4 * ((len(rows) + 2) // 3) + 0.6))
-    axes = figure.subplots((len(rows) + 2) // 3, 3, squeeze=False).flat
+    axes = figure.subplots((len(rows) + 2) // 3, 3, squeeze=False).ravel()
     for ax, row in zip(axes, rows, strict=False):
         _draw_push(ax, data, prediction, row)
         name = data.names[int(data.configuration[row])]
         ax.set_title(f"{name}\ndeviation {float(deviation[row]):.2f} mm", fontsize=9)
-    for ax in list(axes)[len(rows) :]:
+    for ax in axes[len(rows) :]:
         ax.remove()
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
@@ -54,17 +55,19 @@ def draw_configurations(model: PushModel, data: PushData, prediction: PushPredic
     figure = _figure((8.0, 0.42 * len(table) + 1.6))
     ax = figure.subplots()
     values = [row["deviation_mm"] for row in table.values()]
-    ax.barh(range(len(table)), values, color="C0", height=0.6)
-    for k, value in enumerate(values):
-        ax.text(value + 0.02, k, f"{value:.2f}", va="center", fontsize=9)
-    low, high = intervals(found, data, draws=200)["deviation_mm"]
+    lengths = [value if math.isfinite(value) else 0.0 for value in values]
+    ax.barh(range(len(table)), lengths, color="C0", height=0.6)
+    for k, (value, length) in enumerate(zip(values, lengths, strict=True)):
+        ax.text(length + 0.02, k, f"{value:.2f}" if math.isfinite(value) else "diverged", va="center", fontsize=9)
     mean = found.figures()["deviation_mm"]
-    ax.axvspan(low, high, color="0.85", zorder=0)
-    ax.axvline(mean, color="0.4", lw=1, label=f"all: {mean:.2f} mm (95 %: {low:.2f} to {high:.2f})")
+    if math.isfinite(mean):
+        low, high = intervals(found, data, draws=200)["deviation_mm"]
+        ax.axvspan(low, high, color="0.85", zorder=0)
+        ax.axvline(mean, color="0.4", lw=1, label=f"all: {mean:.2f} mm (95 %: {low:.2f} to {high:.2f})")
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=9)
     ax.set_yticks(range(len(table)), list(table), fontsize=9)
     ax.invert_yaxis()
     ax.set_xlabel("mean deviation of the end pose [mm]")
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=9)
     ax.margins(x=0.12)
     return figure
 

@@ -1,5 +1,6 @@
 """What models of pushes are judged by: end poses and forces against the recorded ones."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -81,7 +82,8 @@ def format_score(
     lines = [f"{'figure':<22}{'value':>9}   {'95 % interval':<16} meaning"]
     for name, value in figures.items():
         low, high = spread.get(name, (value, value))
-        lines.append(f"{name:<22}{value:>9.4g}   {f'{low:.4g} .. {high:.4g}':<16} {figure(name).meaning}")
+        interval = f"{low:.4g} .. {high:.4g}" if math.isfinite(value) else "diverged"
+        lines.append(f"{name:<22}{value:>9.4g}   {interval:<16} {figure(name).meaning}")
     width = max(len(name) for name in (*configurations, "configuration")) + 2
     lines += ["", f"{'configuration':<{width}}" + "".join(f"{name:>21}" for name in figures)]
     lines += [
@@ -94,5 +96,5 @@ def format_score(
 def _angle(a: Tensor, b: Tensor) -> Tensor:
     """Degrees between vectors; a right angle where one is zero."""
     size = a.norm(dim=-1) * b.norm(dim=-1)
-    cosine = (a * b).sum(-1) / torch.where(size > 0, size, 1.0)
-    return torch.rad2deg(torch.where(size > 0, cosine, 0.0).clamp(-1.0, 1.0).acos())
+    cosine = (a * b).sum(-1) / torch.where(size == 0, 1.0, size)
+    return torch.rad2deg(torch.where(size == 0, 0.0, cosine).clamp(-1.0, 1.0).acos())

@@ -11,6 +11,8 @@ from pushes import push_arrays
 from lcplearn.datasets.pushes import PushData, read_pushes
 from lcplearn.formulations.pushing import PushModel, PushPrediction, Ridge
 from lcplearn.training.checkpoint import load
+from lcplearn.training.push_figures import draw_pushes
+from lcplearn.training.push_metrics import errors
 from lcplearn.training.push_training import fit_pushes
 
 
@@ -42,6 +44,34 @@ def test_no_push_is_judged_by_a_model_that_was_fitted_to_it(data: PushData, tmp_
     result = fit_pushes(Parrot(**thing(data)), data, folder=tmp_path / "run", progress=False)
     assert result.metrics["position_mm"] > 900.0
     torch.testing.assert_close(result.model.predict(data.pushes).pose, data.outcome.pose, rtol=0, atol=0)  # of all
+
+
+class Lost(Ridge):
+    """Its prediction of the last push is not finite."""
+
+    def predict(self, pushes):
+        found = super().predict(pushes)
+        last = (torch.arange(len(found.pose)) == len(found.pose) - 1)[:, None]
+        return found._replace(pose=found.pose.masked_fill(last, torch.nan))
+
+
+def test_a_push_whose_prediction_is_not_finite_has_infinite_errors_and_is_said_and_drawn(
+    data: PushData, tmp_path: Path
+) -> None:
+    model = Lost(**thing(data))
+    list(model.fit(data.pushes, data.outcome))
+    lost = errors(model, data, model.predict(data.pushes))
+    assert all(value[-1] == torch.inf and value[:-1].isfinite().all() for value in lost.values.values())
+    result = fit_pushes(Lost(**thing(data)), data, folder=tmp_path / "run", progress=False)
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["deviation_mm"] == "diverged"
+    assert "nan" not in result.report
+    assert len(list((tmp_path / "run").glob("*.png"))) == 2
+
+
+def test_pictures_of_pushes_have_one_frame_for_each_configuration(data: PushData) -> None:
+    model = Ridge(**thing(data))
+    list(model.fit(data.pushes, data.outcome))
+    assert len(draw_pushes(model, data, model.predict(data.pushes)).axes) == 2
 
 
 def test_a_run_leaves_its_model_its_figures_and_pictures_and_is_not_overwritten(data: PushData, tmp_path: Path) -> None:
