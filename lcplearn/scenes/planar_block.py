@@ -14,7 +14,7 @@ from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes.contact import Contacts, contact_step
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
-from lcplearn.scenes.scene import Drive, Mode, Step
+from lcplearn.scenes.scene import Drive, Mode, Moving, Step
 from lcplearn.scenes.space import TABLE, Space
 
 
@@ -50,7 +50,7 @@ def slide_on_facets(
 
 
 @dataclass(frozen=True)
-class PlanarBlock:
+class PlanarBlock(Moving):
     """A point mass on a table under a force in the table's plane.
 
     v' = argmin_v 1/2 |v - p|^2 in the metric of mass, + c |v|,    p = v + dt u / mass,    c = mu load dt.

@@ -11,12 +11,12 @@ from torch import Tensor
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check, check_numbers
 from lcplearn.scenes.contact import Contacts, ContactStep, RestitutionLaw, closing_speed, contact_step, rebound
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
-from lcplearn.scenes.scene import Drive, Step
+from lcplearn.scenes.scene import Drive, Moving, Step
 from lcplearn.scenes.space import PLANE, Space
 
 
 @dataclass(frozen=True)
-class PlanarBody:
+class PlanarBody(Moving):
     """A rigid polygon over level ground; y points up.
 
     A state is `PLANE`: x, y, angle of the centre of mass and their velocities; the drive is a force and a torque. A
@@ -106,7 +106,7 @@ STACK = Space(
 
 
 @dataclass(frozen=True)
-class PlanarStack:
+class PlanarStack(Moving):
     """Two rectangles in a vertical plane, the upper on the lower, which is on level ground.
 
     The contacts are the lower one's corners at the ground, then the upper one's corners at the lower one's upper face,

@@ -110,36 +110,40 @@ class Scene(Protocol):
 
 
 class Moving:
-    """Step and rollout under forces alone, for classes with `advance`."""
+    """Step and rollout, for classes with `advance`."""
 
     def step(self: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], force: Float[Tensor, "*#batch nv"]) -> Tensor:
         """Next state under a force [N]."""
         return self.advance(state, Drive(force)).state
 
     def rollout(
-        self: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], forces: Float[Tensor, "*#batch T nv"]
+        self: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], forces: Float[Tensor, "*#batch T nv"] | Drive
     ) -> Trajectory:
-        """Trajectory over T forces [N] from a state."""
-        return rollout(self, state, Drive(forces))
+        """Trajectory from a state [*batch, nq + nv] over T forces [N], or a `Drive` of T steps; see `rollout`."""
+        return rollout(self, state, forces)
 
 
-def rollout(scene: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], drive: Drive) -> Trajectory:
+def rollout(
+    scene: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], drive: Float[Tensor, "*#batch T nv"] | Drive
+) -> Trajectory:
     """Advance a state T times.
 
-    Batch dimensions of state, drive and of the scene's own parameters broadcast. Gradients flow through all steps.
+    Batch dimensions of state, drive and of the scene's own parameters broadcast. Gradients flow through all steps;
+    where a contact is about to change its mode they are those of one side.
 
     Args:
         scene: What moves.
         state: Positions, then velocities, at the start.
-        drive: What acts during each step: force [*batch, T, nv] with T >= 1. The force of step k acts from instant k
-            to k + 1.
+        drive: What acts during each of T >= 1 steps: the force [N], or a `Drive` that has it. The force of step k acts
+            from instant k to k + 1.
 
     Returns:
         The trajectory, with the start as its first instant.
 
     Raises:
-        ValueError: drive.force has fewer than two dimensions or no step, or force or state another number of columns.
+        ValueError: The force has fewer than two dimensions or no step, or force or state another number of columns.
     """
+    drive = drive if isinstance(drive, Drive) else Drive(drive)
     force, space = drive.force, scene.space
     if force.ndim < 2 or force.shape[-2] == 0 or force.shape[-1] != space.nv:
         raise ValueError(f"forces: expected shape [*batch, T, {space.nv}] with T >= 1, got {list(force.shape)}")

@@ -21,12 +21,12 @@ from lcplearn.scenes.contact import (
 )
 from lcplearn.scenes.contact_violation import Touch
 from lcplearn.scenes.numbers import Number, as_tensor, common_batch, matvec, one_batch, stack_numbers
-from lcplearn.scenes.scene import Drive, Step, Trajectory, rollout
+from lcplearn.scenes.scene import Drive, Moving, Step, Trajectory
 from lcplearn.scenes.space import POSE, Space, rotation_matrix
 
 
 @dataclass(frozen=True)
-class SpatialBody:
+class SpatialBody(Moving):
     """A rigid body that touches the ground with spheres around its corners.
 
     A state is `POSE`: position and quaternion, velocity of the centre of mass, angular velocity in body coordinates.
@@ -117,10 +117,6 @@ class SpatialBody:
         moved = torch.where(step.at_rest.unsqueeze(-1), moved - moved.detach() + position.detach(), moved)
         state = torch.cat((moved, step.velocity), dim=-1)
         return Step(state, step.mode, None, step.solved & step.settled)
-
-    def rollout(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Trajectory:
-        """As `scene.rollout`."""
-        return rollout(self, state, drive)
 
     def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
         """The same in one compiled loop, forwards and backwards; None where that can't be: not on the CPU, ..."""

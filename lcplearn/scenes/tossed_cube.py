@@ -12,7 +12,7 @@ from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
 from lcplearn.scenes.contact import RestitutionLaw
 from lcplearn.scenes.contact_violation import contact_violation
 from lcplearn.scenes.numbers import Number
-from lcplearn.scenes.scene import Drive, Step, Trajectory
+from lcplearn.scenes.scene import Drive, Moving, Step, Trajectory
 from lcplearn.scenes.space import POSE, Space
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
@@ -21,7 +21,7 @@ TENTH = 0.00524  # [m] a tenth of the published cube's half width: lengths that 
 
 
 @dataclass(frozen=True)
-class TossedCube:
+class TossedCube(Moving):
     """`SpatialBody` with the corners of a cube, rounded, or with corners of its own.
 
     Attributes:

@@ -4,6 +4,11 @@ import pytest
 import torch
 
 from lcplearn.scenes import BouncingBlock, Drive, FallingBlock, OneWayBlock, SlidingBlock, rollout
+from lcplearn.scenes.planar_block import PlanarBlock
+from lcplearn.scenes.planar_body import PlanarBody, PlanarStack
+from lcplearn.scenes.spatial_body import SpatialBody, box_corners
+from lcplearn.scenes.spring_block import SpringBlock
+from lcplearn.scenes.tossed_cube import TossedCube
 
 SCENES = [
     FallingBlock(1.5, 0.05),
@@ -30,6 +35,25 @@ def test_a_batch_equals_its_trajectories_one_by_one_and_step_by_step(scene):
     for k in range(30):
         state = scene.step(state, forces[:, k])
         torch.testing.assert_close(torch.cat((together.positions, together.velocities), -1)[:, k + 1], state)
+
+
+BODIES = [
+    SpringBlock(mass=1.5, mu=0.4, stiffness=40.0, dt=0.05),
+    PlanarBlock(mass=1.0, mu=0.3, dt=0.05),
+    PlanarBody(corners=torch.tensor([[-0.1, -0.1], [0.1, -0.1], [0.0, 0.2]]).double(), inertia=1e-3, mu=0.3, dt=0.01),
+    PlanarStack(lower=(0.2, 0.1), upper=(0.1, 0.1), masses=(1.0, 1.0), mu=(0.3, 0.3), dt=0.01),
+    SpatialBody(corners=box_corners(torch.full((3,), 0.1, dtype=torch.float64)), inertia=1e-3, mu=0.3, dt=0.01),
+    TossedCube(half_width=0.05, inertia=1e-3, mu=0.3, dt=0.01),
+]
+
+
+@pytest.mark.parametrize("scene", [SCENES[3], *BODIES], ids=lambda scene: type(scene).__name__)
+def test_every_scene_takes_forces_or_a_drive(scene):
+    start, forces = scene.space.origin(), torch.ones(3, scene.space.nv, dtype=torch.float64)
+    paths = [scene.rollout(start, forces), scene.rollout(start, Drive(forces))]
+    paths += [rollout(scene, start, forces), rollout(scene, start, Drive(forces))]
+    assert all(torch.equal(path.states, paths[0].states) for path in paths)
+    torch.testing.assert_close(scene.step(start, forces[0]), paths[0].states[1])
 
 
 def test_gradients_flow_through_all_steps():
