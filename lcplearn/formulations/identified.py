@@ -210,11 +210,14 @@ def _free(name: str, value: Number, domain: Domain) -> nn.Parameter:
 
 
 def clip_rows(gradients: Float[Tensor, "N P"], most: float) -> Float[Tensor, "N P"]:
-    """Clip each row at most times the median norm of those that are not 0; a row that is not finite becomes 0."""
+    """Clip each row at most times the median norm of those that are not 0; a row that is not finite becomes 0.
+
+    Where no row is finite and not 0 they stay as they are: a training without any gradient must not go on in silence.
+    """
     norms = gradients.norm(dim=-1)
     fine = norms.isfinite() & (norms > 0.0)
     if not bool(fine.any()):
-        return torch.zeros_like(gradients)
+        return gradients
     factor = (most * norms[fine].median() / norms).clamp(max=1.0)
     return torch.where(fine.unsqueeze(-1), gradients * factor.unsqueeze(-1), 0.0)
 

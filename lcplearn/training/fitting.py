@@ -175,7 +175,10 @@ def _check_agreement(model: Formulation, data: Task) -> None:
     theirs = {"dt": data.dt, "space": data.space, **data.given}
     for name in sorted(ours.keys() & theirs.keys()):
         if isinstance(ours[name], int | float | Space) and ours[name] != theirs[name]:
-            raise ValueError(f"model: expected {name} = {theirs[name]} as in the data, got {ours[name]}")
+            wanted, got = (
+                ", ".join(each.positions) if isinstance(each, Space) else each for each in (theirs[name], ours[name])
+            )
+            raise ValueError(f"model: expected {name} = {wanted} as in the data, got {got}")
 
 
 def _try_once(model: Formulation, window: Windows, loss: Mapping[str, float]) -> None:

@@ -85,4 +85,4 @@ def suggestion(key: str, known: Iterable[str], prefix: str = "") -> str:
     close = difflib.get_close_matches(key, [name for name in known if name not in UNLIKELY], n=1, cutoff=0.5)
     if close:
         return f"did you mean '{prefix}{close[0]}'?"
-    return f"known are {', '.join(sorted(prefix + name for name in known))}."
+    return f"known are {', '.join(sorted(prefix + name for name in known)) or 'none'}."

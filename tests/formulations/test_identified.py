@@ -16,6 +16,7 @@ from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.domains import NOT_NEGATIVE, Domain
 from lcplearn.formulations import MLP, Formulation, Identified, Physical, Slack, build, loss_terms
 from lcplearn.formulations.cube_corners import CubeCorners
+from lcplearn.formulations.identified import clip_rows
 from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
 from lcplearn.scenes.planar_body import PlanarBody, rectangle
 from lcplearn.scenes.scene import Mode, Moving
@@ -197,6 +198,15 @@ def test_a_threshold_is_softened_where_the_scene_has_one_and_left_alone_elsewher
         exact = model.rollout_error(found)
         with model.softened(1.0):
             assert torch.equal(model.rollout_error(found), exact) != softer
+
+
+def test_rows_are_clipped_at_their_median_norm_and_lost_ones_do_not_pass_for_a_plateau() -> None:
+    nan, inf = float("nan"), float("inf")
+    rows = torch.tensor([[3.0, 4.0], [0.6, 0.8], [0.0, 1.0], [0.0, 0.0], [nan, 1.0], [inf, 1.0]], dtype=torch.float64)
+    clipped = [[1.2, 1.6], [0.6, 0.8], [0.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]  # at 2, twice the median of 1
+    torch.testing.assert_close(clip_rows(rows, 2.0), torch.tensor(clipped, dtype=torch.float64))
+    assert not clip_rows(rows[3:], 2.0).isfinite().all()
+    assert torch.equal(clip_rows(rows[3:4], 2.0), rows[3:4])
 
 
 def test_what_is_given_goes_to_the_device_of_what_is_learned() -> None:

@@ -119,6 +119,7 @@ def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:
         ("trainer.check_val_every_n_epoch=null", "trainer.check_val_every_n_epoch: expected at least 1, got None"),
         ("patience=-1", "patience: expected at least 1, or null for never, got -1"),
         ("seed=-1", "seed: expected at least 0 and below 2^32, got -1"),
+        ("model=slack +model.width=3", "Unknown setting 'model.width'; known are none."),
         ("+model.dt=0.1", "Unknown setting 'model.dt'"),
         ("data.dt=-0.1", "data.dt: expected a positive number, got -0.1"),
         ("data.noise=-1", "data.noise: expected at least 0, got -1"),

@@ -20,6 +20,7 @@ from training.kill import kill_once
 
 from lcplearn.datasets import Task, windows
 from lcplearn.formulations import FORMULATIONS, MLP, Affine, Formulation, Physical, Structured, loss_terms
+from lcplearn.scenes import PLANE
 from lcplearn.training import Optimizer, TrainingDivergedError, TrainingInterrupted, figures, fit, load
 from lcplearn.training.figures_of_merit import KEYS
 from lcplearn.training.metrics import Predictions, evaluate, format_table
@@ -110,8 +111,12 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
 def test_a_model_of_another_time_step_or_gravity_than_the_data_is_refused(tmp_path: Path) -> None:
     """It would learn, but another mass and friction."""
     data = tiny_data()
-    for model, name in ((Structured(dt=2 * data.dt), "dt"), (Structured(dt=data.dt, gravity=1.62), "gravity")):
-        with pytest.raises(ValueError, match=f"^model: expected {name} = .* as in the data, got"):
+    for model, message in (
+        (Structured(dt=2 * data.dt), "dt = 0.05 as in the data, got 0.1"),
+        (Structured(dt=data.dt, gravity=1.62), "gravity = 9.81 as in the data, got 1.62"),
+        (MLP(dt=data.dt, space=PLANE), "space = position_m as in the data, got x_m, y_m, angle_rad"),
+    ):
+        with pytest.raises(ValueError, match=f"^model: expected {message}$"):
             short_fit(model, data, tmp_path / "run")
     with pytest.raises(ValueError, match=r"^epochs: expected at least 1, got 0"):
         short_fit(Structured(dt=data.dt), data, tmp_path / "run", epochs=0)
