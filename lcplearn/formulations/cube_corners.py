@@ -28,7 +28,7 @@ class CubeCorners(Identified):
         seed: Of the noise.
         flat: Whether faces are flat: see `flatten`. With four free corners a face stands on three of them, and the
             body goes on rocking where the recorded one is at rest.
-        clip: As in `Identified`.
+        fixed, clip: As in `Identified`.
     """
 
     def __init__(
@@ -41,6 +41,7 @@ class CubeCorners(Identified):
         ground: float = 0.0,
         seed: int = 0,
         flat: bool = True,
+        fixed: Mapping[str, Any] | None = None,
         clip: float | None = None,
     ) -> None:
         if "half_width" not in given:
@@ -48,8 +49,8 @@ class CubeCorners(Identified):
         half_width, generator = given["half_width"], torch.Generator().manual_seed(seed)
         cube = box_corners(torch.full((3,), half_width, dtype=torch.float64))
         start = cube + noise * half_width * torch.randn(8, 3, generator=generator, dtype=torch.float64)
-        known = {**given, "ground": ground}
-        super().__init__(scene=TossedCube, dt=dt, given=known, learn={**learn, "corners": start.tolist()}, clip=clip)
+        known, learned = {**given, "ground": ground}, {**learn, "corners": start.tolist()}
+        super().__init__(scene=TossedCube, dt=dt, given=known, learn=learned, fixed=fixed, clip=clip)
         self.flat = flat
 
     def bound(self, free: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -31,13 +31,15 @@ class Identified(Formulation):
         dt: Time step [s].
         given: Known values by name, lists for tensors; those that the scene has no use for are left aside.
         learn: Start of each learned number, or list of numbers, by name.
+        fixed: Values by name that are neither learned nor told by data: how the scene is to step, say.
         clip: Times the median norm of the windows' gradients at which each is clipped; None leaves them alone. A
             window whose body is about to land on another corner has a thousand times the gradient of others. 10 is
             right for tosses; 2 biases friction.
 
     Raises:
         ValueError: scene can't be imported or has no numbers, learn names none of them or starts outside its domain,
-            or a value that the scene needs is neither given nor learned.
+            fixed names what the scene has not or what is learned, or a value that the scene needs is neither given
+            nor learned.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class Identified(Formulation):
         dt: float,
         learn: Mapping[str, Number],
         given: Mapping[str, Any] | None = None,
+        fixed: Mapping[str, Any] | None = None,
         clip: float | None = None,
     ) -> None:
         kind = _class(scene)
@@ -56,7 +59,11 @@ class Identified(Formulation):
         if unknown or not learn:
             got = unknown[0] if unknown else "none"
             raise ValueError(f"learn: expected numbers of {kind.__name__} ({', '.join(domains)}), got {got}")
-        known = {name: value for name, value in (given or {}).items() if name in fields.keys() - {"dt", *learn}}
+        odd = [name for name in fixed or {} if name not in fields.keys() - {"dt", *learn}]
+        if odd:
+            raise ValueError(f"fixed: expected arguments of {kind.__name__} that are not learned, got {odd[0]}")
+        given = {**(given or {}), **(fixed or {})}
+        known = {name: value for name, value in given.items() if name in fields.keys() - {"dt", *learn}}
         missing = [
             name
             for name, field in fields.items()
@@ -69,10 +76,10 @@ class Identified(Formulation):
             )
         learned = {name: domains[name] for name in learn}
         starts = {name: _free(f"learn.{name}", value, domains[name]) for name, value in learn.items()}
-        fixed = {name: _tensor(value) if isinstance(value, list) else value for name, value in known.items()}
-        start = kind(dt=dt, **fixed, **{name: _tensor(value) for name, value in learn.items()})
-        super().__init__(space=start.space, dt=dt, given=fixed)
-        self.fixed = fixed
+        known = {name: _tensor(value) if isinstance(value, list) else value for name, value in known.items()}
+        start = kind(dt=dt, **known, **{name: _tensor(value) for name, value in learn.items()})
+        super().__init__(space=start.space, dt=dt, given=known)
+        self.fixed = known
         self.contacts, self.radius = start.contacts, getattr(start, "length", 1.0)
         self.scene_type, self.domains, self.clip = kind, learned, clip
         self.softens = "temperature" in fields

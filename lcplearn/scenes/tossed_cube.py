@@ -32,6 +32,7 @@ class TossedCube(Moving):
         ground: Height of the ground [m].
         corners: Centres of the spheres in body coordinates [m], in place of the cube's; [8, 3] or [*batch, 8, 3].
         polygon: As in `SpatialBody`.
+        substeps: Steps of the contacts within one of dt; the force is that of all of them.
     """
 
     half_width: float
@@ -48,6 +49,7 @@ class TossedCube(Moving):
     restitution_law: RestitutionLaw = "continuous"
     corners: Tensor | None = None
     polygon: int | None = None
+    substeps: int = 1
 
     numbers: ClassVar[Mapping[str, Domain]] = {
         "mu": POSITIVE,
@@ -63,6 +65,8 @@ class TossedCube(Moving):
     def __post_init__(self) -> None:
         check(POSITIVE, half_width=self.half_width)
         check(NOT_NEGATIVE, radius=self.radius)
+        if self.substeps < 1:
+            raise ValueError(f"substeps: expected at least 1, got {self.substeps}")
 
     @property
     def space(self) -> Space:
@@ -91,7 +95,7 @@ class TossedCube(Moving):
             corners=corners,
             inertia=self.inertia,
             mu=self.mu,
-            dt=self.dt,
+            dt=self.dt / self.substeps,
             mass=self.mass,
             radius=self.radius,
             restitution=self.restitution,
@@ -105,12 +109,23 @@ class TossedCube(Moving):
         )
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
-        """Advance a state by one step; the mode is that of each corner."""
-        return self.body.advance(state, drive)
+        """Advance a state by one step; the mode is that of each corner, in the last of the substeps."""
+        steps = [self.body.advance(state, drive)]
+        while len(steps) < self.substeps:
+            steps.append(self.body.advance(steps[-1].state, drive))
+        solved = torch.stack([step.solved for step in steps if step.solved is not None]).all(0)
+        return steps[-1]._replace(solved=solved)
 
     def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
         """As `SpatialBody.fused_rollout`."""
-        return self.body.fused_rollout(state, drive)
+        n = self.substeps
+        path = self.body.fused_rollout(state, drive.map(lambda x: x.repeat_interleave(n, dim=-2)))
+        if path is None or path.solved is None or n == 1:
+            return path
+        positions, velocities = path.positions[..., ::n, :], path.velocities[..., ::n, :]
+        return Trajectory(
+            positions, velocities, path.mode[..., n - 1 :: n, :], path.solved.unflatten(-1, (-1, n)).all(-1)
+        )
 
     def violation(
         self, before: Float[Tensor, "*batch 13"], drive: Drive, after: Float[Tensor, "*batch 13"]

@@ -134,6 +134,11 @@ def test_a_number_stays_between_any_two_ends() -> None:
             {"learn": {"mu": 0.0}, "given": {"mass": 1.0}},
             r"^learn\.mu: expected a number of at least 0, inside its bounds, got 0\.0",
         ),
+        (
+            {"learn": {"mu": 0.1}, "fixed": {"mue": 0.1}},
+            r"^fixed: expected arguments of SlidingBlock that are not learned, got mue",
+        ),
+        ({"learn": {"mu": 0.1}, "fixed": {"mu": 0.1}}, r"^fixed: expected .* not learned, got mu"),
         ({"learn": {"mu": 0.1}}, r"^given: expected mass of SlidingBlock, got none"),
         ({"learn": {"mu": 0.1}, "scene": "lcplearn.scenes.Nothing"}, "^scene: expected the dotted name of a class"),
         ({"learn": {"mu": 0.1}, "scene": Formulation}, "^scene: expected a dataclass"),

@@ -39,6 +39,23 @@ def test_rounded_corners_leave_the_faces_where_they_are_and_rest_is_exact():
         )
 
 
+def test_substeps_are_steps_of_a_shorter_time_under_the_same_force():
+    push = Drive(0.1 * torch.randn(6, 40, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    numbers = {**NUMBERS, "mu_impact": 0.15, "restitution": 0.3, "radius": 0.1 * H}
+    fine = rollout(
+        TossedCube(**{**numbers, "dt": DT / 3}), start(2.0), push.map(lambda x: x.repeat_interleave(3, dim=-2))
+    )
+    cube = TossedCube(**numbers, substeps=3)
+    path = rollout(cube, start(2.0), push)
+    assert torch.equal(path.states, fine.states[:, ::3])
+    assert torch.equal(path.mode, fine.mode[:, 2::3])
+    assert path.solved.shape == (6, 40)
+    assert bool(path.solved.all())
+    step = cube.advance(path.states[:, 20], push.at(20))
+    torch.testing.assert_close(step.state, path.states[:, 21], rtol=0, atol=1e-9)
+    assert torch.equal(step.mode, path.mode[:, 20])
+
+
 def violation(states: torch.Tensor, **numbers: float | torch.Tensor) -> torch.Tensor:
     before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
     drive = Drive(torch.zeros(len(before), 6, dtype=torch.float64))

@@ -2,7 +2,9 @@
 
 import signal
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -54,16 +56,20 @@ class StopInEpoch(Callback):
 
 
 def train(folder: Path, callbacks: Sequence[Callback] = (), ckpt_path: Path | None = None) -> Tensor:
-    """Four epochs in three stages; all parameters at the end."""
+    """Four epochs in three stages; all parameters at the end. Pictures are drawn where a training is resumed."""
     data = simulated()
     start = {"mu": 0.4, "inertia": 0.6 * M * H**2, "restitution": 0.1}
     model = build(CubeCorners, data, learn=start, noise=0.1, clip=10.0)
     stages = [{"epochs": 1, "horizon": 4, "lr": 0.05, "violation": 1.0, "pose": 0.0}, {"epochs": 2, "horizon": 4}]
-    fit(
-        model, data, folder=folder, loss={"pose": 1.0, "violation": 0.5}, horizon=8, stages=stages, epochs=4,
-        batch_size=16, optimizer=Optimizer(lr=0.02), patience=None, ckpt_path=ckpt_path,
-        trainer={**QUIET, "limit_train_batches": 2, "check_val_every_n_epoch": 1, "callbacks": [*callbacks]},
-    )  # fmt: skip
+    drawing = "lcplearn.training.figures.draw", "lcplearn.training.toss_figures.animation"
+    with ExitStack() as stack:
+        for name, nothing in zip(drawing, ({}, b""), strict=True) if ckpt_path is None else ():
+            stack.enter_context(mock.patch(name, return_value=nothing))
+        fit(
+            model, data, folder=folder, loss={"pose": 1.0, "violation": 0.5}, horizon=8, stages=stages, epochs=4,
+            batch_size=16, batches=2, optimizer=Optimizer(lr=0.02), patience=None, ckpt_path=ckpt_path,
+            trainer={**QUIET, "check_val_every_n_epoch": 1, "callbacks": [*callbacks]},
+        )  # fmt: skip
     state = torch.load(folder / "last.ckpt")["state_dict"]
     return torch.cat([values.reshape(-1) for values in state.values()])
 

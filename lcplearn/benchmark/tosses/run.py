@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import torch
@@ -13,11 +14,13 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from lcplearn.benchmark.harness.measuring import interleave
-from lcplearn.benchmark.harness.study import Options, Row, Study, Table
+from lcplearn.benchmark.harness.study import Options, Row, Study, Table, Value
 from lcplearn.benchmark.tosses.mujoco_cube import MujocoCube, tune
 from lcplearn.datasets.cube_tosses import Tosses, read_tosses, split
 from lcplearn.formulations import Formulation, build
+from lcplearn.formulations.cube_corners import CubeCorners
 from lcplearn.scenes.scene import Drive, rollout
+from lcplearn.scenes.spatial_body import box_corners
 from lcplearn.scenes.tossed_cube import TossedCube
 from lcplearn.train import CONF
 from lcplearn.training import fit
@@ -31,12 +34,25 @@ COLUMNS = (
     *("position", "position_median", "position_error", "rotation", "rotation_median", "rotation_error"),
     *("penetration", "same_face", "at_rest", "exact", "unsolved"),
     *("more_position", "more_position_low", "more_position_high"),
-    *("more_rotation", "more_rotation_low", "more_rotation_high", "microseconds"),
+    *("more_rotation", "more_rotation_low", "more_rotation_high", "microseconds", "corners", "training"),
 )
 CHECKPOINTS = {"body": "cube_body.ckpt", "corners": "cube_corners.ckpt"}
 ENGINES = ("MuJoCo, published", "MuJoCo, tuned")
 SYSTEMS = (*CHECKPOINTS, *ENGINES, "published", "free flight")
 COUNTS = (1, 4, 16, 64)
+LEARNED = {
+    "position": "position [% width]", "rotation": "rotation [deg]", "at_rest": "at rest", "exact": "exactly",
+    "unsolved": "unsolved", "corners": "corners [% half width]", "training": "training [s]",
+}  # fmt: skip
+ABLATIONS = {  # what is overridden in experiment=cube_body
+    "as it is": (),
+    "horizon of 32 rows": ("loss.horizon=32",),
+    "one friction": ("~model.learn.mu_impact",),
+    "Newton's restitution": ("+model.fixed.restitution_law=newton",),
+    "two substeps": ("+model.fixed.substeps=2",),
+    "two substeps, Newton's restitution": ("+model.fixed.substeps=2", "+model.fixed.restitution_law=newton"),
+    "compliance learned": ("+model.learn.compliance=0.01",),
+}
 PREDICTS = Callable[[Tensor, int], tuple[Tensor, Tensor | None]]  # start, steps -> states, whether each step is right
 
 
@@ -51,13 +67,19 @@ def run(options: Options) -> None:
         if table == "time":
             row: Row = {"microseconds": microseconds(tosses, str(system), int(number))}
         elif table == "number":
-            folder = options.output / "runs" / f"{system}_{number}_{seed}"
+            folder, started = options.output / "runs" / f"{system}_{number}_{seed}", perf_counter()
             model = trained(f"cube_{system}", int(number), int(seed), folder)
-            row, _ = figures(tosses, judged, _of_model(model), None)
+            row = {"training": perf_counter() - started, "corners": corner_error(model)}
+            row |= figures(tosses, judged, _of_model(model), None)[0]
+        elif table == "ablation":
+            folder = options.output / "runs" / f"{system} {seed}"
+            model = trained("cube_body", int(number), int(seed), folder, *ABLATIONS[str(system)])
+            row, _ = figures(tosses, choose, _of_model(model), None)
         else:
             predicts = system_of(str(system), tosses, learn, options)
-            own = None if system == "body" else figures(tosses, judged, checkpoint("body"), None)[1]
+            own = None if system == "body" else figures(tosses, judged, _of_model(checkpoint("body")), None)[1]
             row, _ = figures(tosses, judged, predicts, own)
+            row["corners"] = corner_error(checkpoint(str(system))) if system in CHECKPOINTS else float("nan")
         study.add((table, system, number, seed), dict.fromkeys(COLUMNS, float("nan")) | row)
     _say(study, has_engine)
     study.finish()
@@ -71,19 +93,29 @@ def _plan(options: Options, has_engine: bool) -> Iterator[tuple[str, str, int, i
     seeds = [options.seed + k for k in range(1 if options.quick else 3)]
     for number in COUNTS[1:2] if options.quick else reversed(COUNTS):
         yield from (("number", name, number, seed) for name in CHECKPOINTS for seed in seeds)
+    yield from (("ablation", name, 64, seed) for name in ABLATIONS for seed in seeds)
     yield "judged", "network", 64, 0
 
 
-def checkpoint(name: str) -> PREDICTS:
+def checkpoint(name: str) -> Formulation:
     """A model that comes with the repository."""
-    folder = Path(__file__).parents[3] / "data" / "checkpoints"
-    return _of_model(load(folder / CHECKPOINTS[name], "cpu"))
+    return load(Path(__file__).parents[3] / "data" / "checkpoints" / CHECKPOINTS[name], "cpu")
+
+
+def corner_error(model: Formulation) -> float:
+    """Root mean square error of learned corners [% of the half width], a common shift aside; NaN without any."""
+    if not isinstance(model, CubeCorners):
+        return float("nan")
+    half_width = model.given["half_width"]
+    corners = model.numbers()["corners"].detach()
+    off = corners - box_corners(torch.full((3,), half_width, dtype=corners.dtype))
+    return float(100.0 / half_width * (off - off.mean(0)).square().mean().sqrt())
 
 
 def system_of(name: str, tosses: Tosses, learn: list[int], options: Options) -> PREDICTS:
     """What predicts states from a start; tuned or trained, if it has to be, on the tosses to learn from."""
     if name in CHECKPOINTS:
-        return checkpoint(name)
+        return _of_model(checkpoint(name))
     if name == "network":
         return _of_model(trained("cube_mlp", 64, 0, options.output / "runs" / "network"))
     if name in ENGINES:
@@ -104,11 +136,11 @@ def system_of(name: str, tosses: Tosses, learn: list[int], options: Options) -> 
     return partial(_roll, partial(rollout, scene))
 
 
-def trained(experiment: str, number: int, seed: int, folder: Path) -> Formulation:
-    """Train what `python train.py experiment=... data.tosses=... seed=...` trains."""
+def trained(experiment: str, number: int, seed: int, folder: Path, *more: str) -> Formulation:
+    """Train what `python train.py experiment=... data.tosses=... seed=...`, and more overrides, trains."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         overrides = [f"experiment={experiment}", f"data.tosses={number}", f"seed={seed}", "data.judge=false"]
-        config = compose("train", overrides=[*overrides, "logger=none"])
+        config = compose("train", overrides=[*overrides, "logger=none", *more])
     data = replace(instantiate(config.data, _convert_="all"), judged_by=())  # who judges is no business of a training
     asked = instantiate(config.model, _partial_=True, _convert_="all")
     loss, trainer = (instantiate(part, _convert_="all") for part in (config.loss, config.trainer))
@@ -165,7 +197,8 @@ def microseconds(tosses: Tosses, system: str, batch: int) -> float:
     """Median wall time of a row, in rollouts of 100 rows."""
     start = tosses.states[:batch, 0]
     cube = MujocoCube(radius=0.1)
-    predicts = checkpoint(system) if system in CHECKPOINTS else lambda x, steps: (cube.rollout(tosses, x, steps), None)
+    ours = system in CHECKPOINTS
+    predicts = _of_model(checkpoint(system)) if ours else lambda x, steps: (cube.rollout(tosses, x, steps), None)
     call = partial(predicts, start, 100)
     call()
     return 1e4 * interleave({"": call}, 15)[""].wall / batch
@@ -179,7 +212,17 @@ def _say(study: Study, has_engine: bool) -> None:
         "median in brackets, standard error of the mean. `more` is by how much an error exceeds that of `body` on the "
         "same tosses, with its 95 % interval." + ("" if has_engine else " MuJoCo is not installed: left out."),
         table=Table(
-            ("system", "position [% width]", "more", "rotation [deg]", "more", "penetration", "at rest", "exactly"),
+            (
+                "system",
+                "position [% width]",
+                "more",
+                "rotation [deg]",
+                "more",
+                "penetration",
+                "at rest",
+                "exactly",
+                "unsolved",
+            ),
             [[name, *_cells(row)] for name, row in judged.items()],
         ),
     )
@@ -196,13 +239,21 @@ def _say(study: Study, has_engine: bool) -> None:
     for name in CHECKPOINTS:
         for number in dict.fromkeys(row["tosses"] for row in learned):
             those = [row for row in learned if row["system"] == name and row["tosses"] == number]
-            rows.append(
-                [name, number, *(_spread(those, what) for what in ("position", "rotation", "at_rest", "exact"))]
-            )
+            rows.append([name, number, *(_spread(those, what) for what in LEARNED)])
     study.say(
         "How many tosses does a model need?",
         "Median over seeds (smallest to largest); a seed is another split, another start and another order.",
-        table=Table(("model", "tosses", "position [% width]", "rotation [deg]", "at rest", "exactly"), rows),
+        table=Table(("model", "tosses", *LEARNED.values()), rows),
+    )
+    tried = {name: {row["seed"]: row for row in study.rows if row["system"] == name} for name in ABLATIONS}
+    study.say(
+        "What if the body were otherwise?",
+        "`body` from 64 tosses with something changed, on the choosing tosses of each split: mean over the splits, and "
+        "the difference to `body` as it is on the same tosses, smallest and largest of the splits.",
+        table=Table(
+            ("body", "position [% width]", "more", "rotation [deg]", "more", "exactly at rest"),
+            [[name, *_changes(rows, tried["as it is"])] for name, rows in tried.items()],
+        ),
     )
     for what, unit in (("position", "position integral [% of width]"), ("rotation", "rotation integral [deg]")):
         runs = {
@@ -219,7 +270,17 @@ def _cells(row: Row) -> list[str]:
         cells.append(f"{row[name]:.2f} ({row[f'{name}_median']:.1f}) +- {row[f'{name}_error']:.2f}")
         low, high = row[f"more_{name}_low"], row[f"more_{name}_high"]
         cells.append("-" if low != low else f"{row[f'more_{name}']:+.2f} [{low:+.2f}, {high:+.2f}]")
-    return [*cells, f"{row['penetration']:.2f}", f"{row['at_rest']:.3f}", f"{row['exact']:.3f}"]
+    shares = (f"{row['at_rest']:.3f}", f"{row['exact']:.3f}", f"{row['unsolved']:.1e}")
+    return [*cells, f"{row['penetration']:.2f}", *shares]
+
+
+def _changes(rows: dict[Value, Row], others: dict[Value, Row]) -> list[str]:
+    cells = []
+    for what in ("position", "rotation"):
+        more = sorted(float(row[what]) - float(others[seed][what]) for seed, row in rows.items())
+        mean = sum(float(row[what]) for row in rows.values()) / len(rows)
+        cells += [f"{mean:.2f}", f"{more[0]:+.2f} to {more[-1]:+.2f}"]
+    return [*cells, f"{sum(float(row['exact']) for row in rows.values()) / len(rows):.3f}"]
 
 
 def _spread(rows: list[Row], what: str) -> str:
