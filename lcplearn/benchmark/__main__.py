@@ -22,6 +22,7 @@ STUDIES = {
     "pushes": "real pushes: gradients, times, how many a model needs, planning with a learned one",
     "tosses": "real tosses of a cube: learned bodies, simulators and a network on the same tosses; how many are needed",
     "overhead": "one problem a call, and memory",
+    "growth": "one large problem: time, gradient and memory to n = 400",
     "threads": "what more threads gain, against the batch, on an idle machine and on a busy one",
     "devices": "problems a second on a CUDA device, beside the CPU kernel on all cores",
 }
