@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(options.threads)
-    if options.command in ("fuzz", "audit", "against"):
+    if options.command in ("fuzz", "audit", "against", "epoch"):
         import_module(f"lcplearn.benchmark.{options.command}.run").run(options)
         return
     from lcplearn.benchmark.harness.study import Options
@@ -86,6 +86,9 @@ def _parser() -> argparse.ArgumentParser:
     against.add_argument("tree", type=Path, metavar="TREE", help="folder of the other checkout")
     against.add_argument("--rounds", type=_at_least(1), default=9, metavar="N", help="of each family (default: 9)")
     _add_threads_and_seed(against)
+    epoch = commands.add_parser("epoch", help="where the time of a training's epoch goes, part by part")
+    epoch.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for train.py")
+    _add_threads_and_seed(epoch)
     report = commands.add_parser("report", help="gather studies into one self-contained HTML page")
     report.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="folders that commands wrote")
     report.add_argument("--output", type=Path, default=Path("report.html"), metavar="FILE", help="default: report.html")

@@ -1,0 +1,1 @@
+"""`benchmark epoch`: where the time of a training's epoch goes."""
