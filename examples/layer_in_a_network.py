@@ -25,7 +25,7 @@ class Equilibrium(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         M = self.factor @ self.factor.T + self.skew - self.skew.T + 0.1 * torch.eye(len(self.factor))
-        return self.layer(M, self.q(x)).z  # an element that is not solved has z = 0 here, and a zero gradient
+        return self.layer(M, self.q(x)).z  # what is not solved has a zero gradient (this M is always solved)
 
 
 def main(steps: int = 600) -> float:

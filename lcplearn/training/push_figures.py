@@ -61,7 +61,7 @@ def draw_configurations(model: PushModel, data: PushData, prediction: PushPredic
         ax.text(length + 0.02, k, f"{value:.2f}" if math.isfinite(value) else "diverged", va="center", fontsize=9)
     mean = found.figures()["deviation_mm"]
     if math.isfinite(mean):
-        low, high = intervals(found, data, draws=200)["deviation_mm"]
+        low, high = intervals(found, data)["deviation_mm"]
         ax.axvspan(low, high, color="0.85", zorder=0)
         ax.axvline(mean, color="0.4", lw=1, label=f"all: {mean:.2f} mm (95 %: {low:.2f} to {high:.2f})")
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=9)
