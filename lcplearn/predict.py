@@ -1,12 +1,12 @@
 """Predict with a trained model: python -m lcplearn.predict CHECKPOINT --input forces.csv --output motion.csv
 
 CSV input has a header and a column `force` [N] (`force_1`, `force_2`, ... for models of several velocities), one row a
-time step; models that need measured friction also read
-`friction_plus` and `friction_minus` [N]; a column `time_s` or `time` [s] must have the model's steps. NPZ input has
-`forces` [T, nv] or [N, T, nv], without nv where it is 1, and may have `friction` [..., T, 2], `state` [..., nq + nv]
-and `dt` [s]. `--score DATA`
-judges the model on recordings instead: cube_slides.npz, or an NPZ file with `dt` and the arrays of
-lcplearn.datasets.Recordings.
+time step. Models that need measured friction also read `friction_plus` and `friction_minus` [N]. A column `time_s` or
+`time` [s] must have the model's steps. NPZ input has `forces` [T, nv] or [N, T, nv], without nv where it is 1, and may
+have `friction` [..., T, 2], `state` [..., nq + nv] and `dt` [s].
+
+`--score DATA` judges the model on recordings instead: cube_slides.npz, or an NPZ file with `dt` and the arrays that
+lcplearn.datasets.read_recordings names.
 
 A model of pushes is judged by `--score PUSHES.npz`, a file like planar_pushes.npz; `--output` is then an NPZ file of
 predictions, `post_pose` (pushes, 3) [m, m, rad] and `force` (pushes, 2) [N].
