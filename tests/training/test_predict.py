@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,17 @@ def test_an_npz_input_of_another_time_step_is_refused(checkpoint: Path, tmp_path
     np.savez(tmp_path / "in.npz", forces=np.ones(3), dt=0.01)
     with pytest.raises(SystemExit, match=r"time steps of 0\.01 s, but the model was trained for 0\.05 s"):
         predict.main([str(checkpoint), "--input", str(tmp_path / "in.npz")])
+
+
+def test_times_may_be_rounded(tmp_path: Path) -> None:
+    model = Physical(dt=1 / 148)
+    for digits, fits in ((6, True), (4, False)):
+        path = forces_csv(tmp_path, "time,force", [f"{k / 148:.{digits}f},1" for k in range(10)])
+        with nullcontext() if fits else pytest.raises(ValueError, match="equal steps"):
+            predict.predict(model, read_inputs(path))
+    path = forces_csv(tmp_path, "time,force", [f"{k / 150:.6f},1" for k in range(10)])
+    with pytest.raises(ValueError, match="but the model was trained for"):
+        predict.predict(model, read_inputs(path))
 
 
 def test_recordings_are_looked_for_where_train_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
