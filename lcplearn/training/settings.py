@@ -146,11 +146,11 @@ def _check_learn(learn: Any) -> None:
 
 
 def _check_friction(settings: Mapping[str, Any]) -> None:
-    """Models of known friction learn from labels that only simulations have."""
+    """Models of known friction learn from labels, which of lcplearn's data only simulated ones have."""
     model = str(settings["model"].get("_target_")).rpartition(".")[2]
-    if model not in ("Direct", "PlanarDirect", "Slack"):
-        return
     data = str(settings["data"].get("_target_"))
+    if model not in ("Direct", "PlanarDirect", "Slack") or not data.startswith("lcplearn."):
+        return
     if model == "Slack" and "planar" in data:
         raise SettingsError(
             "model=slack is for a block on a line: in two directions the slacks don't determine the velocity."

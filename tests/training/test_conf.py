@@ -162,6 +162,11 @@ def test_a_mistake_gets_one_sentence_with_a_suggestion(overrides: str, message: 
     assert "\n" not in str(error.value)
 
 
+def test_recordings_of_ones_own_may_have_measured_friction() -> None:
+    chosen = settings("model=direct")
+    check(chosen | {"data": {"_target_": "mine.read_recordings_with_friction"}}, CONF)
+
+
 def test_a_missing_checkpoint_is_compared_with_those_that_are_there(tmp_path: Path) -> None:
     (tmp_path / "last.ckpt").touch()
     with pytest.raises(SettingsError, match=r"did you mean .*last\.ckpt"):
