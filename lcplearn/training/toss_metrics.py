@@ -53,7 +53,7 @@ def score_tosses(
     rows = torch.arange(recorded.shape[1]) <= steps[:, None]
     percent = 50.0 / half_width
     distance, angle = pose_errors(recorded, predicted)
-    lowest, lowest_recorded = (_lowest_corner(state, half_width) for state in (predicted, recorded))
+    lowest, lowest_recorded = (lowest_corner(state, half_width) for state in (predicted, recorded))
     depth, depth_recorded = (-lowest).clamp(min=0.0), (-lowest_recorded).clamp(min=0.0)
     below_board = (BOARD * half_width - lowest).clamp(min=0.0)
     penetration, penetration_recorded = (percent * _mean(value, rows) for value in (depth, depth_recorded))
@@ -107,7 +107,7 @@ def score_restarts(
         found[f"rotation error after {horizon} {name} [deg]"] = angle
         if horizon == 1:
             near = (BOARD + CONTACT_HEIGHT) * half_width
-            touches = torch.minimum(_lowest_corner(before, half_width), _lowest_corner(after, half_width)) < near
+            touches = torch.minimum(lowest_corner(before, half_width), lowest_corner(after, half_width)) < near
             error = (reached - after)[touches]
             found["one-step velocity error in contact [m/s]"] = error[:, 7:10].norm(dim=-1)
             found["one-step angular velocity error in contact [rad/s]"] = error[:, 10:].norm(dim=-1)
@@ -146,7 +146,7 @@ def format_scores(scores: Mapping[str, Float[Tensor, " N"]]) -> str:
     return "\n".join(lines)
 
 
-def _lowest_corner(state: Float[Tensor, "*batch 13"], half_width: float) -> Float[Tensor, "*batch"]:
+def lowest_corner(state: Float[Tensor, "*batch 13"], half_width: float) -> Float[Tensor, "*batch"]:
     """Height over z = 0 of the cube's lowest corner: |R_z1| + |R_z2| + |R_z3| half widths below the centre."""
     up = rotation_matrix(_unit(state))[..., 2, :]
     return state[..., 2] - half_width * up.abs().sum(-1)

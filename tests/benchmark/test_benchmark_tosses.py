@@ -1,5 +1,6 @@
 """`benchmark tosses`: the simulator that learned bodies are compared with, and what is said of each system."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from lcplearn.benchmark.tosses.mujoco_cube import MujocoCube
 from lcplearn.benchmark.tosses.run import _roll, figures
+from lcplearn.benchmark.tosses.starts import denoised
 from lcplearn.datasets.cube_tosses import Tosses
 from lcplearn.scenes.scene import rollout
 from lcplearn.scenes.tossed_cube import TossedCube
@@ -44,6 +46,17 @@ def test_a_cube_of_mujoco_comes_to_lie_on_the_board():
     end = MujocoCube(radius=0.2, ground=0.0).rollout(ours, ours.states[:, 0], 300)[:, -1]
     np.testing.assert_allclose(end[:, 2], H, atol=1e-3)
     assert float(end[:, 7:10].norm(dim=-1).max()) < 0.01
+
+
+def test_denoised_starts_are_the_starts_of_a_flight_without_noise_and_nearer_to_them_with_it():
+    true = tosses(40.0, 30)
+    torch.testing.assert_close(denoised(true).states, true.states, rtol=0, atol=1e-9)
+    noisy = true.states.clone()
+    noisy[..., 7:] += 0.1 * torch.randn(noisy[..., 7:].shape, generator=torch.Generator().manual_seed(1))
+    found = denoised(replace(true, states=noisy)).states
+    assert torch.equal(found[:, 1:], noisy[:, 1:])
+    left, before = ((x - true.states)[:, 0, 7:].norm() for x in (found, noisy))
+    assert float(left) < 0.4 * float(before)  # of 29 and 31 rows: 0.18
 
 
 def test_who_predicts_right_has_no_error_and_who_does_not_is_said_to_have_more():

@@ -16,6 +16,7 @@ from torch import Tensor
 from lcplearn.benchmark.harness.measuring import interleave
 from lcplearn.benchmark.harness.study import Options, Row, Study, Table, Value
 from lcplearn.benchmark.tosses.mujoco_cube import MujocoCube, tune
+from lcplearn.benchmark.tosses.starts import denoised
 from lcplearn.datasets.cube_tosses import Tosses, read_tosses, split
 from lcplearn.formulations import Formulation, build
 from lcplearn.formulations.cube_corners import CubeCorners
@@ -38,7 +39,8 @@ COLUMNS = (
 )
 CHECKPOINTS = {"body": "cube_body.ckpt", "corners": "cube_corners.ckpt"}
 ENGINES = ("MuJoCo, published", "MuJoCo, tuned")
-SYSTEMS = (*CHECKPOINTS, *ENGINES, "published", "free flight")
+DENOISED = "body, denoised starts"
+SYSTEMS = (*CHECKPOINTS, DENOISED, *ENGINES, "published", "free flight")
 COUNTS = (1, 4, 16, 64)
 LEARNED = {
     "position": "position [% width]", "rotation": "rotation [deg]", "at_rest": "at rest", "exact": "exactly",
@@ -78,7 +80,7 @@ def run(options: Options) -> None:
         else:
             predicts = system_of(str(system), tosses, learn, options)
             own = None if system == "body" else figures(tosses, judged, _of_model(checkpoint("body")), None)[1]
-            row, _ = figures(tosses, judged, predicts, own)
+            row, _ = figures(denoised(tosses) if system == DENOISED else tosses, judged, predicts, own)
             row["corners"] = corner_error(checkpoint(str(system))) if system in CHECKPOINTS else float("nan")
         study.add((table, system, number, seed), dict.fromkeys(COLUMNS, float("nan")) | row)
     _say(study, has_engine)
@@ -114,8 +116,8 @@ def corner_error(model: Formulation) -> float:
 
 def system_of(name: str, tosses: Tosses, learn: list[int], options: Options) -> PREDICTS:
     """What predicts states from a start; tuned or trained, if it has to be, on the tosses to learn from."""
-    if name in CHECKPOINTS:
-        return _of_model(checkpoint(name))
+    if name in CHECKPOINTS or name == DENOISED:
+        return _of_model(checkpoint("body" if name == DENOISED else name))
     if name == "network":
         return _of_model(trained("cube_mlp", 64, 0, options.output / "runs" / "network"))
     if name in ENGINES:
