@@ -22,8 +22,8 @@ def loss_terms(model: Formulation, windows: Windows, weights: Mapping[str, float
     pose:             robust distance of positions over all steps of the window [m], see `Formulation.pose_error`
     complementarity:  (friction * (v+, v-))^2, `direct` and `slack` only
     nonnegativity:    max(0, -(v+, v-))^2, `direct` and `slack` only
-    violation:        how badly the best friction explains a measured step: of the first one `structured`, of all scenes
-                      that say so
+    violation:        how badly the best friction explains the measured steps: the first of each window for
+                      `structured`, all of them for scenes that have a `violation`
 
     Args:
         model: The formulation to judge.

@@ -28,6 +28,13 @@ class FallingBlock(Moving):
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2]. Number or tensor that broadcasts over the batch.
 
+    Gradient: With respect to the state, the force and all numbers; where the block just touches that of one side.
+
+    Status: `Step.solved`.
+
+    Raises:
+        ValueError: A number is out of its domain; the message names it.
+
     Source: Pfrommer's "LCP Notes" (2019), section 1, with general mass and an external force; NOTES 5.1.
     """
 
@@ -94,6 +101,14 @@ class BouncingBlock(Moving):
         restitution: Ratio e of rebound to impact speed; 0 <= e <= 1.
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2].
+
+    Gradient: With respect to the state, the force and all numbers, at the contact that was found. Which step an impact
+        falls into is no smooth function of anything: the velocity jumps there, and the gradient does not see it.
+
+    Status: `Step.solved`.
+
+    Raises:
+        ValueError: A number is out of its domain; the message names it.
 
     Source: NOTES 5.2; Moreau 1988.
     """

@@ -71,6 +71,14 @@ class PlanarBlock(Moving):
         form: Which of the three.
         m: Number of facets.
 
+    Gradient: Of the exact forms, with respect to the state, the force and all numbers; at the change of stick and slip
+        that of one side.
+
+    Status: `Step.solved`; None for the closed form, which solves nothing.
+
+    Raises:
+        ValueError: A number is out of its domain, or form does not fit mass and m.
+
     Source: NOTES 5.7.
     """
 

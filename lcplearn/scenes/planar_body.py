@@ -35,7 +35,15 @@ class PlanarBody(Moving):
         restitution_law: See `rebound`.
         rest: Whether rest is written as 0 (see `contact_step`).
 
-    Source: Stewart and Trinkle 1996.
+    Gradient: Implicit, with respect to the state, the drive and all numbers; one-sided at a change of mode. Which step
+        an impact falls into is not differentiated.
+
+    Status: `Step.solved`: the LCP was solved and the contacts settled.
+
+    Raises:
+        ValueError: A number is out of its domain, or corners have another shape.
+
+    Source: Stewart and Trinkle 1996; NOTES 5.7.
     """
 
     numbers: ClassVar[Mapping[str, Domain]] = {

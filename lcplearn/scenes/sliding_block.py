@@ -54,6 +54,13 @@ class OneWayBlock(Moving):
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2]; >= 0.
 
+    Gradient: With respect to the state, the force and all numbers; at the kink p = c that of one side.
+
+    Status: `Step.solved`.
+
+    Raises:
+        ValueError: A number is out of its domain; the message names it.
+
     Source: Pfrommer's "LCP Notes" (2019), section 2.1, with general mass and forces in newtons; NOTES 5.3.
     """
 
@@ -130,6 +137,14 @@ class SlidingBlock(Moving):
         temperature: Softening T of the threshold [m/s]; >= 0. At 0 the LCP is solved. Above 0,
             T softplus((+-p - c) / T) replaces (v+, v-): its gradient with respect to mu is nowhere zero, so that
             training may start with it where no sample is predicted to slip, and anneal it to 0.
+
+    Gradient: Of the state, with respect to the state before, the force and all numbers: exact, and at the kink
+        |p| = c that of one side. Forces at stick are not unique and have no gradient worth following.
+
+    Status: `Step.solved`; None with a temperature, where no LCP is solved.
+
+    Raises:
+        ValueError: A number is out of its domain, or form is none of the three; the message names it.
 
     Source: Pfrommer's "LCP Notes" (2019), sections 2.2 (direct) and 2.5 (traditional), with general mass and dt and
     forces in newtons; NOTES 5.4 to 5.6.

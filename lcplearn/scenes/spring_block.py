@@ -31,6 +31,13 @@ class SpringBlock(Moving):
         dt: Step size [s]; > 0.
         gravity: Gravitational acceleration [m/s^2]; >= 0.
 
+    Gradient: With respect to the state, the force and all numbers; at the change of stick and slip that of one side.
+
+    Status: `Step.solved`.
+
+    Raises:
+        ValueError: A number is out of its domain; the message names it.
+
     Source: Stewart and Trinkle 1996 (implicit in velocity and force); NOTES 5.4 is its case without a spring.
     """
 

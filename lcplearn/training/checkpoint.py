@@ -109,7 +109,7 @@ def read(path: str | Path, map_location: str | torch.device | None = None) -> di
         ValueError: no such file, or not a checkpoint of lcplearn.
     """
     if not Path(path).is_file():
-        raise ValueError(f"There is no checkpoint {path}; a run's are runs/DATE_TIME/best.ckpt and last.ckpt.")
+        raise ValueError(f"There is no checkpoint {path}; the last run has runs/latest/best.ckpt and last.ckpt.")
     try:
         checkpoint = torch.load(path, map_location=map_location, weights_only=True)
     except Exception as error:  # torch.load raises whatever its unpickler met: any of it means the same to the user

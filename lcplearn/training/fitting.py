@@ -78,7 +78,7 @@ def fit(
     Args:
         model: What to train; its parameters are changed in place.
         data: Recordings to learn from.
-        loss: Weights of the loss terms; {"prediction": 1.0} by default.
+        loss: Weights of the loss terms, see `lcplearn.formulations.loss_terms`; {"prediction": 1.0} by default.
         horizon: Steps of a training window; rollout and pose use more than one.
         stages: What comes before, each with its epochs and what differs: lr, a shorter horizon, weights of loss terms.
         epochs: Epochs to train at most, those of stages included.
