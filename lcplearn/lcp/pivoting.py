@@ -21,13 +21,17 @@ Source: Cottle, Pang, Stone, "The Linear Complementarity Problem" (1992), chapte
 block pivoting; Mehrotra (1992) for the predictor-corrector steps; Ruiz (2001) for the scaling.
 """
 
+from functools import cache
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from lcplearn.lcp.kernel.adjoint import adjoint_range
+from lcplearn.lcp.kernel.calling import address_of
 from lcplearn.lcp.kernel.cascade import solve_range
-from lcplearn.lcp.kernel.jit import announce
+from lcplearn.lcp.kernel.islands import FEWEST_ROWS, islands_memory, solve_islands
+from lcplearn.lcp.kernel.jit import APART, announce
 from lcplearn.lcp.kernel.memory import scratch_size
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.threads import in_slices, slice_size
@@ -74,14 +78,31 @@ def solve_batch(
 
     def solve(start: int, stop: int) -> int:
         row = start * n
-        return solve_range(
+        problem = (
             stop - start, n, shared, address(M, 0 if shared else row * n), address(q, row), tol, single_precision,
-            budget, warm, np.empty(scratch_size.py_func(n)), address(z, row), address(w, row), address(basis, row),
-            address(residual, start), address(status, start), address(iterations, start), address(certificate, row),
+            budget, warm,
         )  # fmt: skip
+        scratch = np.empty(scratch_size.py_func(n))
+        fields = (
+            address(z, row), address(w, row), address(basis, row), address(residual, start), address(status, start),
+            address(iterations, start), address(certificate, row),
+        )  # fmt: skip
+        left = solve_range(*problem, True, scratch, *fields)
+        if left and n >= FEWEST_ROWS and bool((status.view(-1)[start:stop] == APART).any()):
+            announce(solve_islands, "compiling a stage for problems of several parts, once on a machine: about 5 s")
+            memory = np.empty(islands_memory(n))
+            left = solve_islands(solver_address(), *problem, scratch, memory, *fields)
+        return left
 
-    size = slice_size(count, count * _seconds(n)) if torch.get_num_threads() > 1 else count
-    return LCPSolution(z, w, basis, status, residual, iterations, certificate), sum(in_slices(solve, count, size))
+    unsolved = sum(in_slices(solve, count, slice_size(count, count * _seconds(n))))
+    return LCPSolution(z, w, basis, status, residual, iterations, certificate), unsolved
+
+
+@cache
+def solver_address() -> int:
+    """Where the code of `solve_range` is, for compiled code that calls it."""
+    places = (0,) * 7
+    return address_of(solve_range, 1, 2, False, 0, 0, 1e-10, False, -1, False, False, np.empty(1), *places)
 
 
 def _seconds(n: int) -> float:
@@ -117,24 +138,23 @@ def solve_adjoint(
         interior point), y solves the consistent part of the equations: the gradient of unique quantities is exact.
     """
     n, shared, count = z.shape[-1], M.dim() == 2, status.numel()
+    summed = need_M and shared
     grad_q, grad_M = _empty(z.shape), _empty(M.shape) if need_M and not shared else None
 
     def solve(start: int, stop: int) -> Tensor | None:
         row = start * n
-        part = _empty(M.shape) if need_M and shared else None
+        part = _empty(M.shape) if summed else None
         adjoint_range(
             stop - start, n, shared, address(M, 0 if shared else row * n), address(z, row), address(basis, row),
             address(status, start), address(grad_z, row), address(grad_w, row), np.empty(n * n + 7 * n),
-            single_precision, address(part) if shared else address(grad_M, row * n), address(grad_q, row),
+            single_precision, address(part) if summed else address(grad_M, row * n), address(grad_q, row),
         )  # fmt: skip
         return part
 
-    size = count
-    if shared or torch.get_num_threads() > 1:
-        size = slice_size(count, ADJOINT_SHARE * count * _seconds(n))
-    if shared:
+    size = slice_size(count, ADJOINT_SHARE * count * _seconds(n))
+    if summed:
         size = max(size, n)  # the sums of slices then take no more memory than q
-    for part in in_slices(solve, count, size):  # in their order, so that no bit depends on the number of threads
+    for part in in_slices(solve, count, size, summed=summed):
         grad_M = part if grad_M is None else grad_M if part is None else grad_M + part
     return grad_M, grad_q
 

@@ -18,7 +18,7 @@ Result = TypeVar("Result")
 WORTHWHILE = 0.5e-3  # work of a thread [s]: to wake one takes 20 to 30 microseconds
 SLICE = 0.125e-3  # work of a slice [s]
 MOST_SLICES = 256
-LATE = 0.2  # share of a call that waits for a helper's last slice: more means that the machine has other work
+LATE = 2.0  # slices for which a helper's last one is waited: more means that the machine has other work
 LONGEST_PAUSE = 63  # calls without helpers, before they are tried again
 
 
@@ -28,35 +28,41 @@ def slice_size(count: int, seconds: float) -> int:
     return -(-count // max(slices, 1))
 
 
-def in_slices(task: Callable[[int, int], Result], count: int, size: int) -> list[Result]:
+def in_slices(task: Callable[[int, int], Result], count: int, size: int, *, summed: bool = False) -> list[Result]:
     """What `task(start, stop)` returns for each slice of `range(count)`, in their order.
 
-    At most `torch.get_num_threads()` threads work, and this one is always among them.
+    At most `torch.get_num_threads()` threads work, and this one is always among them. Where it is alone all is one
+    slice, unless the results are to be summed, bit by bit as on several threads.
     """
     if size >= count:
         return [task(0, count)]
     slices = deque((start, min(start + size, count)) for start in range(0, count, size))
     results: dict[int, Result] = {}
 
-    def work() -> None:
+    def work() -> int:
+        taken = 0
         while slices:
             try:
                 start, stop = slices.popleft()
             except IndexError:  # another thread was faster
-                return
+                break
             results[start] = task(start, stop)
+            taken += 1
+        return taken
 
-    begun = time.perf_counter()
     helpers = _start(work, min(torch.get_num_threads(), int(len(slices) * SLICE / WORTHWHILE)) - 1)
+    if not helpers and not summed:
+        return [task(0, count)]
+    begun, taken = time.perf_counter(), 0
     try:
-        work()
+        taken = work()
     finally:
         done = time.perf_counter()
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
-        if helpers:
-            _pause.after(time.perf_counter() - done > LATE * (done - begun))
+    if helpers:
+        _pause.after((time.perf_counter() - done) * taken > LATE * (done - begun))
     return [results[start] for start in sorted(results)]
 
 
@@ -78,7 +84,7 @@ class _Pause:
 _pause = _Pause()
 
 
-def _start(work: Callable[[], None], count: int) -> list["Future[None]"]:
+def _start(work: Callable[[], int], count: int) -> list["Future[int]"]:
     if count < 1 or not _pause.over():
         return []
     try:

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lcplearn.scenes.contact_kernel.compiling import call, compiled, fingerprint, solver_address
+from lcplearn.lcp.kernel.calling import call
+from lcplearn.lcp.pivoting import solver_address
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
 from lcplearn.scenes.contact_kernel.steps import contacts_address
 
 SMALL = 1e-8  # squared half angle below which series are exact; as in space.py

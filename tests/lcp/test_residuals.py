@@ -7,17 +7,19 @@ import torch
 from lcplearn import solve_lcp
 from lcplearn.benchmark.problems import families as problems
 from lcplearn.lcp.kernel import judging
+from lcplearn.lcp.kernel.memory import padded
 from lcplearn.lcp.residuals import equilibrate, judge
 
 
 def judged_by_kernel(M: np.ndarray, q: np.ndarray, z: np.ndarray, tol: float = 1e-10) -> tuple[float, float]:
     """Residual and tolerance by the kernel's own steps, for one problem."""
     n = len(q)
-    d, largest, p, w, omega = np.empty((5, n))
-    size, S = np.empty((2, n, n))
-    judging.equilibrate(M, size, largest, d)
-    r, c = d.copy(), d.copy()
-    s = judging.scale(M, q, r, c, S, p)
+    width = padded.py_func(n)
+    d, rows, largest, r, c, p, w, omega = (x[:n] for x in np.ones((8, width)))
+    S, rest = np.empty((width, width))[:n], np.empty(4)
+    judging.equilibrate(M, rows, largest, rest, d)
+    r[:], c[:] = d, d
+    s = judging.scale(M, q, r, c, rest, S, p)
     scaled = z / s / c
     judging.evaluate(S, p, scaled, w, omega)
     return judging.judge(q, S, p, d, r, c, s, scaled, w, omega, tol)

@@ -54,7 +54,8 @@ def test_a_shared_matrix_gets_the_sum_of_its_elements_gradients():
 
 def test_several_threads_take_slices_and_the_results_are_in_the_order_of_the_batch():
     assert threads_of_two_slices() == 2
-    assert threads.in_slices(lambda start, stop: (start, stop), 35, 2) == [(k, min(k + 2, 35)) for k in range(0, 35, 2)]
+    parts = threads.in_slices(lambda *ends: ends, 35, 2, summed=True)
+    assert parts == [(k, min(k + 2, 35)) for k in range(0, 35, 2)]
 
 
 def test_small_work_wakes_no_thread(monkeypatch):
@@ -91,7 +92,13 @@ class _EndedPool:
 def test_what_a_thread_has_not_begun_the_caller_does(monkeypatch, pool):
     torch.set_num_threads(2)
     monkeypatch.setattr(threads, "_pool", lambda: pool)
-    assert threads.in_slices(lambda start, stop: (start, stop), 10, 1) == [(k, k + 1) for k in range(10)]
+    assert threads.in_slices(lambda *ends: ends, 10, 1, summed=True) == [(k, k + 1) for k in range(10)]
+
+
+def test_a_thread_that_is_alone_takes_all_at_once_but_for_sums():
+    torch.set_num_threads(1)
+    assert threads.in_slices(lambda *ends: ends, 10, 1) == [(0, 10)]
+    assert threads.in_slices(lambda *ends: ends, 10, 4, summed=True) == [(0, 4), (4, 8), (8, 10)]
 
 
 def test_an_error_on_another_thread_reaches_the_caller():

@@ -323,7 +323,8 @@ def test_the_compiled_step_and_its_gradient_are_those_of_torch(scene, compliance
 
 def test_compiled_code_is_found_by_the_types_it_is_for():
     pytest.importorskip("numba")
-    from lcplearn.scenes.contact_kernel.compiling import address_of, compiled
+    from lcplearn.lcp.kernel.calling import address_of
+    from lcplearn.scenes.contact_kernel.compiling import compiled
 
     def half(x):
         return x / 2

@@ -203,12 +203,27 @@ def _diagonal_with_zero_rows(rng: Generator, B: int) -> Case:
     return _integer(rng, B, make, "decided")
 
 
+def _islands(rng: Generator, B: int) -> Case:
+    """Problems side by side in one, and rows that do nothing, in any order."""
+    kinds = (_p_dense, _semidefinite, _half_integers, _friction_2d, _friction_3d, _nearly_at_rest)
+    parts = [kinds[rng.integers(len(kinds))](rng, B) for _ in range(rng.integers(2, 6))]
+    idle = int(rng.integers(0, 20))
+    n = sum(part.q.shape[1] for part in parts) + idle
+    M, q = np.tile(np.eye(n), (B, 1, 1)), np.ones((B, n))
+    start = 0
+    for part in parts:
+        rows = slice(start, start := start + part.q.shape[1])
+        M[:, rows, rows], q[:, rows] = part.M, part.q
+    order = rng.permutation(n)
+    return Case(M[:, order][:, :, order], q[:, order])
+
+
 FAMILIES: dict[str, Callable[[Generator, int], Case]] = {
     make.__name__.replace("_", " ").strip(): make
     for make in (
         _p_dense, _p_triangular, _h_matrix, _m_matrix, _scaled_apart, _congruent, _far_from_one, _semidefinite,
         _redundant_rows, _half_integers, _friction_2d, _friction_3d, _normal_3d, _nearly_at_rest, _any_integers,
         _sparse_integers, _negative_diagonal, _copositive, _psd_integers, _skew_integers, _p_integers,
-        _diagonal_with_zero_rows,
+        _diagonal_with_zero_rows, _islands,
     )
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""`benchmark overhead`: what a call costs beside the solve: one problem a call, backward against forward, memory."""
+"""`benchmark overhead`: what a call costs beside the solve: one problem a call, backward, memory, rows to spare."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,12 +10,24 @@ from torch import Tensor
 from lcplearn import solve_lcp
 from lcplearn.benchmark.harness.measuring import interleave, peak_memory
 from lcplearn.benchmark.harness.study import Options, Row, Study, Table
-from lcplearn.benchmark.problems.families import RANDOM_FAMILIES, positive_definite
+from lcplearn.benchmark.problems.families import RANDOM_FAMILIES, positive_definite, stacked_cubes
 
-COLUMNS = ("forward", "both", "forward_empty", "both_empty", "forward_interface", "both_interface", "to_q", "bytes")
+COLUMNS = (
+    "forward",
+    "both",
+    "forward_empty",
+    "both_empty",
+    "forward_interface",
+    "both_interface",
+    "to_q",
+    "bytes",
+    "parts",
+)
 SIZES = (2, 3, 8, 24)
 BATCH = 1024
 MEMORY_BATCH, MEMORY_N = 100_000, 24
+PARTS = {"2 cubes": (2, 0), "4 cubes": (4, 0), "16 cubes": (16, 0), "cube + 12 idle rows": (1, 12),
+         "cube + 24 idle rows": (1, 24), "cube + 72 idle rows": (1, 72)}  # fmt: skip
 
 
 class EmptyFunction(torch.autograd.Function):
@@ -98,6 +110,27 @@ def memory(to_M: bool, batch: int) -> Row:
     return {"bytes": peak_memory(lambda: solve_lcp(M, q).z.sum().backward())}
 
 
+def problems_of_parts(case: str, repeats: int) -> Row:
+    """Median time [us] of separate cubes and rows that do nothing as one problem, and of its cubes by themselves."""
+    cubes, idle = PARTS[case]
+    batch = BATCH // (8 * cubes)
+    M, q, _ = stacked_cubes(np.random.default_rng(0), batch * cubes)
+    n = q.shape[1]
+    whole = np.tile(np.eye(cubes * n + idle), (batch, 1, 1))
+    whole_q = np.ones((batch, cubes * n + idle))
+    for cube in range(cubes):
+        rows = slice(cube * n, cube * n + n)
+        whole[:, rows, rows], whole_q[:, rows] = M[cube::cubes], q[cube::cubes]
+    together, alone = tuple(map(torch.from_numpy, (whole, whole_q))), tuple(map(torch.from_numpy, (M, q)))
+    calls: dict[str, Callable[[], Any]] = {
+        "forward": lambda: solve_lcp(*together),
+        "parts": lambda: solve_lcp(*alone),
+    }
+    for call in calls.values():
+        call()
+    return {name: 1e6 * timing.cpu / batch for name, timing in interleave(calls, repeats).items()}
+
+
 def run(options: Options) -> None:
     """Measure and print."""
     study = Study("overhead", options, ("table", "case"), COLUMNS)
@@ -108,6 +141,8 @@ def run(options: Options) -> None:
             row = one_problem_a_call(int(case), repeats)
         elif table == "backward":
             row = backward_beside_forward(str(case), max(repeats // 5, 3))
+        elif table == "parts":
+            row = problems_of_parts(str(case), max(repeats // 5, 3))
         else:
             row = memory(case == "to M and q", batch)
         study.add((table, case), row)
@@ -118,6 +153,7 @@ def run(options: Options) -> None:
 def _plan() -> Iterator[tuple[str, str | int]]:
     yield from (("one problem a call", n) for n in SIZES)
     yield from (("backward", family) for family in RANDOM_FAMILIES)
+    yield from (("parts", case) for case in PARTS)
     yield from (("memory", case) for case in ("to q", "to M and q"))
 
 
@@ -147,6 +183,14 @@ def _say(study: Study, batch: int) -> None:
                 (row["case"], row["forward"], row["to_q"] / row["forward"], row["both"] / row["forward"] - 1.0)
                 for row in rows("backward")
             ],
+        ),
+    )
+    study.say(
+        "What does a problem of several parts cost?",
+        "Microseconds of separate cubes (n = 24 each) and rows that do nothing as one problem, and of the cubes alone.",
+        table=Table(
+            ("problem", "us", "its cubes", "ratio"),
+            [(row["case"], row["forward"], row["parts"], row["forward"] / row["parts"]) for row in rows("parts")],
         ),
     )
     size = 8.0 * batch * MEMORY_N**2

@@ -7,7 +7,9 @@ import numpy as np
 
 from lcplearn.lcp.kernel.block_pivoting import block_pivoting, leave_ray, polish
 from lcplearn.lcp.kernel.interior_point import interior_point
+from lcplearn.lcp.kernel.islands import FEWEST_ROWS, falls_apart, seems_connected
 from lcplearn.lcp.kernel.jit import (
+    APART,
     CAPPED,
     DONE,
     EPS,
@@ -35,6 +37,7 @@ from lcplearn.lcp.kernel.judging import (
 from lcplearn.lcp.kernel.lemke import lemke, prove_infeasible
 from lcplearn.lcp.kernel.memory import address, pointer, workspace
 from lcplearn.lcp.kernel.scales import solve_by_scale
+from lcplearn.lcp.kernel.vectors import inverse_of_power
 
 # The stages in their order. BLOCK is block pivoting, where it is faster than Lemke's method; IMPROVE the same from what
 # LEMKE found, unless the residual is that of rounding. Then rows and columns are scaled apart: block pivoting, Lemke's
@@ -68,7 +71,7 @@ def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
     for i in range(z.size):
         holds = basis[i] and z[i] >= TINY
         z_out[i] = c[i] * s * z[i] if holds else 0.0
-        w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s / r[i]
+        w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s * inverse_of_power(r[i])
         basis_out[i] = basis[i] != 0
         outside += not (z_out[i] <= LARGEST and w_out[i] <= LARGEST) or (holds and z_out[i] < smallest)
     return outside == 0
@@ -137,7 +140,7 @@ def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out
                 r[i] = c[i] = d[i]
             if stage == APART_BLOCK:
                 rescale(M, r, c, x)
-            s = scale(M, q, r, c, S, p)
+            s = scale(M, q, r, c, buffer, S, p)
         ended, count = run_stage(
             stage, left, budget, accepted, tol, single_precision, q, s, numbers, indices, basis_out
         )
@@ -171,12 +174,13 @@ def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out
 
 def _make(sources: str) -> Any:
     def solve_range(
-        B, n, shared, M_at, q_at, tol, single_precision, budget, warm, scratch,
+        B, n, shared, M_at, q_at, tol, single_precision, budget, warm, split, scratch,
         z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at
     ):  # fmt: skip
-        """Run the cascade for each element; the number of UNSOLVED ones.
+        """Run the cascade for each element; the number of those that are left, UNSOLVED or (if split) APART.
 
-        The last arguments are addresses of the fields of LCPSolution.
+        The last arguments are addresses of the fields of LCPSolution. An element that is APART keeps its initial basis,
+        and its u is the label of each row's island.
         """
         sources  # noqa: B018 - in the closure, for numba's cache
         Ms, qs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(pointer(q_at, 0.0), (B, n))
@@ -185,9 +189,9 @@ def _make(sources: str) -> Any:
         residuals, statuses = numba.carray(pointer(residual_at, 0.0), (B,)), numba.carray(pointer(status_at, 0), (B,))
         iterations = numba.carray(pointer(iterations_at, 0), (B,))
         numbers, indices = workspace(address(scratch), n)
-        _, A, _, d, _, _, _, _, _, _, _, x, _, _, _ = numbers
-        _, _, _, _, basis, _, _ = indices
-        unsolved = 0
+        _, _, _, d, _, _, _, _, _, _, _, x, y, _, buffer = numbers
+        _, _, index, basic, basis, _, _ = indices
+        left = 0
         for b in range(B):
             Mb, qb = Ms[0 if shared else b], qs[b]
             for i in range(n):  # until a stage has a candidate
@@ -203,12 +207,18 @@ def _make(sources: str) -> Any:
                 for i in range(n):  # numba compiles a check of shapes with its message for a slice: seconds
                     ws[b, i] = qb[i]
                 continue
-            equilibrate(Mb, A, x, d)
+            if split and n >= FEWEST_ROWS and not seems_connected(Mb, index) and falls_apart(Mb, index, basic):
+                for i in range(n):
+                    bases[b, i], us[b, i] = warm and basis[i] != 0, index[i]
+                statuses[b] = APART
+                left += 1
+                continue
+            equilibrate(Mb, y, x, buffer, d)
             statuses[b], residuals[b], iterations[b] = solve_one(
                 Mb, qb, tol, single_precision, budget, warm, numbers, indices, zs[b], ws[b], bases[b], us[b]
             )
-            unsolved += statuses[b] == UNSOLVED
-        return unsolved
+            left += statuses[b] == UNSOLVED
+        return left
 
     return solve_range
 

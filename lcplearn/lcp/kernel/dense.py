@@ -81,12 +81,12 @@ def members(basis, index):
 
 @jit_inline
 def gather(S, basis, A, index):
-    """Copy S_AA to A and A's members to index; its size."""
+    """Copy S_AA, of an S stored by columns, to A and A's members to index; its size."""
     k = members(basis, index)
     for a in range(k):
         i = index[a]
         for b in range(k):
-            A[a, b] = S[i, index[b]]
+            A[a, b] = S[index[b], i]
     return k
 
 

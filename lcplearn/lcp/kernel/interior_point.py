@@ -31,7 +31,7 @@ def interior_point(S, p, A, rows, cols, z, w, omega, r, dz, dw, scratch, cap):
             return iteration
         for i in range(n):
             for j in range(n):
-                A[i, j] = S[i, j]
+                A[i, j] = S[j, i]
             A[i, i] += w[i] / z[i]
         if factor_call(A, n, rows, cols, 0.0, PARTIAL) < n:
             return iteration

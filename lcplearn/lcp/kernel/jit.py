@@ -13,6 +13,7 @@ import numba
 RUIZ_SWEEPS = 4  # as in residuals.py
 EPS = 2.220446049250313e-16
 SOLVED, INFEASIBLE, UNSOLVED, MAX_ITERATIONS, NONFINITE_INPUT = 0, 1, 2, 3, 4  # solution.Status, as plain constants
+APART = 5  # the status of what `islands` has still to solve
 DONE, STUCK, CAPPED = 0, 1, 2  # how a stage ended
 EXPONENT = 0x7FF0000000000000  # bits of a double that remain when it is rounded down to a power of two
 LARGEST = 1.7976931348623157e308  # of all doubles

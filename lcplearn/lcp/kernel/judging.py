@@ -1,11 +1,20 @@
 """Scaling of a problem, and the judge of its solution: the residual of residuals.py, for scaled data."""
 
-from math import frexp, ldexp, sqrt
+from math import sqrt
 
 import numpy as np
 
-from lcplearn.lcp.kernel.jit import EPS, EXPONENT, LARGEST, RUIZ_SWEEPS, TINY, jit, jit_call, jit_inline, jit_merged
-from lcplearn.lcp.kernel.memory import address, integers
+from lcplearn.lcp.kernel.jit import EPS, LARGEST, RUIZ_SWEEPS, TINY, jit, jit_call, jit_inline, jit_merged
+from lcplearn.lcp.kernel.memory import address, padded, vector
+from lcplearn.lcp.kernel.vectors import (
+    add_columns,
+    divide_by_roots,
+    even_out,
+    inverse_of_power,
+    largest_entries,
+    power_below,
+    scale_transposed,
+)
 
 
 @jit
@@ -27,36 +36,51 @@ def all_finite(x):
 
 
 @jit_merged
-def equilibrate(M, size, largest, d):
-    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; size and largest are scratch."""
+def copy_rest(M, rest):
+    """Copy the entries of M's last row that fill no vector of 4."""
+    n = M.shape[0]
+    for j in range(n // 4 * 4, n):
+        rest[j % 4] = M[n - 1, j]
+
+
+@jit_merged
+def equilibrate_few(M, largest, d):
+    """As `equilibrate`, for less than a vector of rows."""
     n = d.size
     for i in range(n):
         d[i] = 1.0
-        for j in range(i + 1):
-            a, b = abs(M[i, j]), abs(M[j, i])
-            if b > a:
-                a = b
-            size[i, j] = a
-            size[j, i] = a
     for _ in range(RUIZ_SWEEPS):
-        for j in range(n):
-            largest[j] = 0.0
-        for i in range(0, n, 2):  # two rows at a time; the last twice if n is odd
-            k = min(i + 1, n - 1)
-            di, dk = d[i], d[k]
-            for j in range(n):
-                one, other = size[i, j] * di, size[k, j] * dk
-                one = one if one > other else other
-                largest[j] = one if one > largest[j] else largest[j]
         uneven = 0
-        for j in range(n):
-            scaled = largest[j] * d[j]
-            largest[j] = scaled if scaled > 0.0 else 1.0
-            uneven += abs(largest[j] - 1.3) > 0.83  # as in residuals.py
+        for i in range(n):
+            size = 0.0
+            for j in range(n):
+                a, b = abs(M[i, j]), abs(M[j, i])
+                a = (a if a > b else b) * d[j]
+                size = a if a > size else size
+            largest[i] = size * d[i] if size * d[i] > 0.0 else 1.0
+            uneven += abs(largest[i] - 1.3) > 0.83  # as in residuals.py
         if uneven == 0:
             break
-        for j in range(n):
-            d[j] /= sqrt(max(largest[j], TINY))
+        for i in range(n):
+            d[i] /= sqrt(max(largest[i], TINY))
+
+
+@jit_merged
+def equilibrate(M, rows, largest, rest, d):
+    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; rows, largest and rest are scratch."""
+    n = d.size
+    if n < 4:
+        equilibrate_few(M, largest, d)
+        return
+    scales, blocks = vector(address(d), padded(n)), padded(n) // 4
+    for i in range(padded(n)):
+        scales[i] = 1.0
+    copy_rest(M, rest)
+    for _ in range(RUIZ_SWEEPS):
+        largest_entries(address(M), address(rest), address(d), address(rows), address(largest), n)
+        if not even_out(address(rows), address(largest), address(d), 1.3, 0.83, TINY, blocks):  # as in residuals.py
+            break
+        divide_by_roots(address(d), address(largest), blocks)
 
 
 @jit
@@ -80,39 +104,40 @@ def rescale(M, r, c, largest):
 
 
 @jit_merged
-def scale(M, q, r, c, S, p):
-    """S = R M C and p = R q / s without rounding, as r, c and s become powers of two; returns s.
+def scale(M, q, r, c, rest, S, p):
+    """S = R M C and p = R q / s without rounding, as r, c and s become powers of two; returns s. rest is scratch.
 
-    A solution z', w' for S and p is z = s C z', w = s R^-1 w' for M and q.
+    S is stored by columns, S[j, i], that are padded with zeros. A solution z', w' for S and p is z = s C z',
+    w = s R^-1 w' for M and q.
     """
     n = q.size
-    row_bits, column_bits = integers(address(r), n), integers(address(c), n)
-    s = 0.0
+    s = TINY
     for i in range(n):
-        row_bits[i] &= EXPONENT
-        column_bits[i] &= EXPONENT
+        r[i], c[i] = power_below(r[i]), power_below(c[i])
         s = max(s, abs(r[i] * q[i]))
-    s = ldexp(0.5, frexp(max(s, TINY))[1])
+    s = power_below(s)
+    inverse = 1.0 / s
     for i in range(n):
-        ri = r[i]
-        p[i] = ri * q[i] / s
-        for j in range(n):
-            S[i, j] = ri * M[i, j] * c[j]
+        p[i] = r[i] * q[i] * inverse
+    if n < 4:
+        for i in range(n):
+            for j in range(n, 4):
+                S[i, j] = 0.0
+            for j in range(n):
+                S[i, j] = r[j] * M[j, i] * c[i]
+        return s
+    padding = vector(address(r), S.shape[1])
+    for i in range(n, S.shape[1]):
+        padding[i] = 0.0
+    copy_rest(M, rest)
+    scale_transposed(address(M), address(rest), address(r), address(c), address(S), n)
     return s
 
 
 @jit_inline
 def evaluate(S, p, z, w, omega):
     """w = S z + p and the size of what was added up, omega = |S| z + |p|."""
-    n = p.size
-    for i in range(n):
-        total, size = p[i], abs(p[i])
-        for j in range(n):
-            term = S[i, j] * z[j]
-            total += term
-            size += abs(term)
-        w[i] = total
-        omega[i] = size
+    add_columns(address(S), address(p), address(z), address(w), address(omega), p.size, S.shape[1] // 4)
 
 
 @jit
@@ -120,7 +145,7 @@ def largest_share(S, z, omega, j):
     """The largest part that column j has in what a row is a sum of: z_j counts by it however rows and columns scale."""
     largest = 0.0
     for i in range(z.size):
-        term = abs(S[i, j]) * z[j]
+        term = abs(S[j, i]) * z[j]
         if term > largest * omega[i]:
             largest = term / omega[i]
     return largest
@@ -136,19 +161,20 @@ def judge(q, S, p, d, r, c, s, z, w, omega, tol):
     lost = False  # q spans more than the range of doubles: its small rows are not in p, and nobody has solved them
     for i in range(n):
         z_size = max(z_size, c[i] * z[i])
+    inverse = 1.0 / z_size if z_size > 0.0 else 0.0
     for i in range(n):
-        f = d[i] / r[i]
-        natural = max(natural, abs(min(c[i] * z[i] / d[i], w[i] * f)))
+        inverse_r = inverse_of_power(r[i])
+        f, z_i, p_i = d[i] * inverse_r, c[i] * z[i], abs(p[i])
+        natural = max(natural, abs(min(z_i / d[i], w[i] * f)))
         noise = max(noise, EPS * f * omega[i] if abs(w[i]) <= 8.0 * EPS * omega[i] else 0.0)
-        q_size = max(q_size, f * abs(p[i]))
-        w_share = w[i] / max(omega[i], smallest * r[i]) if w[i] != 0.0 else 0.0
-        z_share = c[i] * z[i] / z_size if z[i] > 0.0 else 0.0
-        if z[i] > 0.0 and w_share > 64.0 * EPS and w_share > z_share and w_share > rows:
+        q_size = max(q_size, f * p_i)
+        w_share, z_share = w[i] / max(omega[i], smallest * r[i], TINY), z_i * inverse
+        if (z_share > 0.0) & (w_share > 64.0 * EPS) & (w_share > z_share) & (w_share > rows):
             z_share = max(z_share, largest_share(S, z, omega, i))
         rows = max(rows, abs(min(z_share, w_share)))
-        absMz = max(absMz, f * (omega[i] - abs(p[i])))
-        lost = lost or (abs(p[i]) < TINY and abs(q[i]) >= unseen)
-        total += abs(w[i]) * s / r[i] + c[i] * s * z[i]
+        absMz = max(absMz, f * (omega[i] - p_i))
+        lost |= (p_i < TINY) & (abs(q[i]) >= unseen)
+        total += abs(w[i]) * s * inverse_r + z_i * s
     residual = max(natural / q_size, rows)
     if noise > 1e-10 * q_size:
         residual = max(residual, noise / q_size)
@@ -167,7 +193,7 @@ def drop_noise(z, w, omega, S, tol):
     for i in range(n):
         if omega[i] <= 1e-12 * z_size and abs(w[i]) > tol * omega[i]:
             for j in range(n):
-                if S[i, j] != 0.0 and 0.0 < z[j] <= 1e-12 * z_size:
+                if S[j, i] != 0.0 and 0.0 < z[j] <= 1e-12 * z_size:
                     z[j] = 0.0
                     dropped = True
     return dropped

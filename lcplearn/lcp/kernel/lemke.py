@@ -3,7 +3,8 @@
 import numpy as np
 
 from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, LARGEST, STUCK, jit, jit_inline, jit_merged
-from lcplearn.lcp.kernel.memory import add_product, address
+from lcplearn.lcp.kernel.memory import address, vector
+from lcplearn.lcp.kernel.vectors import add_product, smallest_ratio
 
 # Equation i says: basic variable = T[n + 1, i] + sum_c T[c, i] * (nonbasic variable of column c), n + 1 columns, stored
 # one after the other: ratio tests and updates then run along contiguous memory (1.3 to 1.5 times as fast). Variables
@@ -14,7 +15,7 @@ from lcplearn.lcp.kernel.memory import add_product, address
 
 
 @jit_inline
-def start_tableau(S, p, cover, T, basic, column, place):
+def start_tableau(S, p, cover, T, basic, column, place, factor):
     """Dictionary at w = p + S z + cover z_0, with z_0 already exchanged for the lexicographically smallest row."""
     n = p.size
     row, smallest = 0, np.inf
@@ -28,14 +29,17 @@ def start_tableau(S, p, cover, T, basic, column, place):
         T[n, i] = ratio = cover[i] * inverse
         T[n + 1, i] = p[i] - ratio * p[row]
     T[n, row], T[n + 1, row] = inverse, -p[row] * inverse
+    width = T.shape[1]
+    for i in range(n, width):
+        T[n, i] = T[n + 1, i] = 0.0
+    columns, entries = vector(address(T), n * width), vector(address(S), n * width)
+    for k in range(n * width):
+        columns[k] = entries[k]
     for j in range(n):
-        pivot = S[row, j]
-        for i in range(n):
-            T[j, i] = S[i, j] - T[n, i] * pivot
-        T[j, row] = -pivot * inverse
-    for j in range(n + 2):
-        for i in range(n, T.shape[1]):
-            T[j, i] = 0.0
+        factor[j] = -S[j, row]
+    add_product(address(T), address(factor), address(T) + 8 * n * width, n, width // 4)
+    for j in range(n):
+        T[j, row] = factor[j] * inverse
     basic[row], column[n] = 2 * n, row
     place[2 * n], place[row] = row, -1 - n
     return row
@@ -63,16 +67,9 @@ def exchange(T, basic, column, place, row, c, factor, buffer):
 def leaving_row(T, place, c, tolerance, ratio, tied):
     """Row that first reaches zero as the variable of column c grows, by the lexicographic rule; -1 on a ray."""
     n = T.shape[0] - 2
-    for i in range(n):
-        slope, value = -T[c, i], T[n + 1, i]
-        value = (value if value > 0.0 else 0.0) / slope
-        ratio[i] = value if slope > tolerance else np.inf
-    best, other = np.inf, np.inf
-    for i in range(0, n, 2):
-        k = min(i + 1, n - 1)
-        best = ratio[i] if ratio[i] < best else best
-        other = ratio[k] if ratio[k] < other else other
-    best = min(best, other)
+    width = T.shape[1]
+    values = address(T) + 8 * (n + 1) * width
+    best = smallest_ratio(address(T) + 8 * c * width, values, address(ratio), tolerance, width // 4)
     if best == np.inf:
         return -1
     best += 1e-12 * (1.0 + best)
@@ -104,7 +101,7 @@ def leaving_row(T, place, c, tolerance, ratio, tied):
 def lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, basis, z, cap):
     """Follow Lemke's path until z_0 leaves; z and basis of the last dictionary, how it ended, and the pivots."""
     n = p.size
-    row = start_tableau(S, p, cover, T, basic, column, place)
+    row = start_tableau(S, p, cover, T, basic, column, place, ratio)
     leaving, pivots, ended = row, 1, CAPPED
     while pivots < cap:
         entering = leaving + n if leaving < n else leaving - n
@@ -134,7 +131,7 @@ def prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, rati
     """
     n = p.size
     cover[:] = 1.0
-    row = start_tableau(S, p, cover, T, basic, column, place)
+    row = start_tableau(S, p, cover, T, basic, column, place, ratio)
     u[:] = 0.0
     for _ in range(cap):
         row = place[2 * n]

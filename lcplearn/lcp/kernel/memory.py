@@ -1,11 +1,10 @@
-"""Bare views of memory, and vector operations that LLVM does not find by itself."""
+"""Bare views of memory."""
 
 from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
 from lcplearn.lcp.kernel.jit import jit, jit_merged
@@ -26,35 +25,6 @@ def _pointer_code(_, address, example):
 
 
 pointer: Any = intrinsic(_pointer_code)
-
-
-def _add_product_code(_, target, factors, source, columns, blocks):
-    """target[j] += factors[j] * source for columns of vectors of 4 doubles, a block of rows after the other.
-
-    LLVM's own vectoriser leaves rests of up to 15 to scalars.
-    """
-
-    def codegen(context, builder, signature, args):
-        double, i32 = ir.DoubleType(), ir.IntType(32)
-        four = ir.VectorType(double, 4)
-        target, source = (builder.inttoptr(args[i], four.as_pointer()) for i in (0, 2))
-        factors = builder.inttoptr(args[1], double.as_pointer())
-        with cgutils.for_range(builder, args[4]) as rows:
-            s = builder.load(builder.gep(source, [rows.index]), align=8)
-            start = builder.gep(target, [rows.index])
-            with cgutils.for_range(builder, args[3]) as column:
-                f = builder.load(builder.gep(factors, [column.index]))
-                f = builder.insert_element(ir.Constant(four, ir.Undefined), f, i32(0))
-                f = builder.shuffle_vector(f, f, ir.Constant(ir.VectorType(i32, 4), [0] * 4))
-                t = builder.gep(start, [builder.mul(column.index, args[4])])
-                product = builder.fmul(s, f, flags=("contract",))
-                builder.store(builder.fadd(builder.load(t, align=8), product, flags=("contract",)), t, align=8)
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64, types.intp, types.intp), codegen
-
-
-add_product: Any = intrinsic(_add_product_code)
 
 
 @jit
@@ -82,6 +52,12 @@ def integers(at, size):
 
 
 @jit
+def padded(n):
+    """The size as a multiple of 4."""
+    return (n + 3) // 4 * 4
+
+
+@jit
 def lines(numbers):
     """Bytes of so many numbers in whole cache lines: vectors of 4 doubles then never cross one."""
     return (numbers + 7) // 8 * 64
@@ -90,16 +66,21 @@ def lines(numbers):
 @jit
 def scratch_size(n):
     """Numbers of memory that `workspace` cuts up."""
-    return 3 * n * n + 25 * n + 198  # with room for whole cache lines
+    return 3 * n * n + 31 * n + 207  # with room for whole cache lines
 
 
 @jit_merged
 def workspace(at, n):
-    """Arrays of doubles and of integers for an element of size n, from memory of `scratch_size(n)` numbers."""
-    width, at = (n + 3) // 4 * 4, (at + 63) // 64 * 64
-    square, line = lines(n * n), lines(n + 2)  # of x and buffer a little more is asked for than of the other vectors
-    S, A, T = matrix(at, n, n), matrix(at + square, n, n), matrix(at + 2 * square, n + 2, width)
-    at += 2 * square + lines((n + 2) * width)
+    """Arrays of doubles and of integers for an element of size n, from memory of `scratch_size(n)` numbers.
+
+    The scaled matrix S is stored by columns, S[j, i], each padded as those of the tableau T are. There is room for
+    vectors of 4 at the end of all of them.
+    """
+    width, at = padded(n), (at + 63) // 64 * 64
+    line = lines(n + 2)  # of x and buffer a little more is asked for than of the other vectors
+    S, at = matrix(at, n, width), at + lines(width * width)
+    A, at = matrix(at, n, n), at + lines(n * n)
+    T, at = matrix(at, n + 2, width), at + lines((n + 2) * width)
     d, r, c, p = vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n)
     at += 4 * line
     cover, z, w, omega = vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n)

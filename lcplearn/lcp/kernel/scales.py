@@ -47,7 +47,7 @@ def exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch):
     for b in range(m):
         j = members[b]
         for a in range(k):
-            x[a] = (1.0 if index[a] == j else 0.0) if basis[j] else -S[index[a], j]
+            x[a] = (1.0 if index[a] == j else 0.0) if basis[j] else -S[j, index[a]]
         solve_call(A, k, k, rows, cols, x, scratch)
         for a in range(k):
             scratch[index[a]] = x[a]
@@ -55,10 +55,10 @@ def exchanged(S, A, k, rows, cols, index, basis, members, m, P, x, scratch):
             i = members[a]
             total, size = scratch[i], 1.0
             if not basis[i]:
-                total = 0.0 if basis[j] else S[i, j]
+                total = 0.0 if basis[j] else S[j, i]
                 size = abs(total)
                 for e in range(k):
-                    term = S[i, index[e]] * x[e]
+                    term = S[index[e], i] * x[e]
                     total += term
                     size += abs(term)
             P[a, b] = total if abs(total) > 1e-13 * size else 0.0
@@ -71,11 +71,11 @@ def solve_small(P, small, flips, cap, scratch):
     numbers, indices = workspace(address(scratch), m)
     S, A, T, d, r, c, p, cover, z, w, omega, x, y, _, buffer = numbers
     rows, cols, index, basic, basis, column, place = indices
-    equilibrate(P, A, x, d)
+    equilibrate(P, y, x, buffer, d)
     for i in range(m):
         r[i] = c[i] = d[i]
         cover[i] = 1.0
-    scale(P, small, r, c, S, p)
+    scale(P, small, r, c, buffer, S, p)
     ended, count = lemke(S, p, cover, 1e-9, T, basic, column, place, buffer, x, index, flips, z, cap)
     if ended == STUCK:
         for i in range(m):

@@ -4,7 +4,8 @@ from math import sqrt
 
 import numpy as np
 
-from lcplearn.scenes.contact_kernel.compiling import call, compiled
+from lcplearn.lcp.kernel.calling import call
+from lcplearn.scenes.contact_kernel.compiling import compiled
 
 
 @compiled
@@ -15,8 +16,9 @@ def solve_lcp(address, n, M, q, scratch, out):
     call(
         address,
         (
-            1, n, False, M.ctypes.data, q.ctypes.data, 1e-10, False, -1, False, scratch, at, at + word * n,
-            at + word * 3 * n, at + word * 4 * n, at + word * (4 * n + 1), at + word * (4 * n + 2), at + word * 2 * n,
+            1, n, False, M.ctypes.data, q.ctypes.data, 1e-10, False, -1, False, False, scratch, at,
+            at + word * n, at + word * 3 * n, at + word * 4 * n, at + word * (4 * n + 1), at + word * (4 * n + 2),
+            at + word * 2 * n,
         ),
     )  # fmt: skip
     return out[4 * n + 1 : 4 * n + 2].view(np.int64)[0] == 0

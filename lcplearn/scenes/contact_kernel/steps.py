@@ -8,15 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lcplearn.lcp.kernel.calling import address_of
+from lcplearn.lcp.pivoting import solver_address
 from lcplearn.scenes.contact import ContactStep
 from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
-from lcplearn.scenes.contact_kernel.compiling import (
-    address_of,
-    compiled,
-    fingerprint,
-    refuse_batched,
-    solver_address,
-)
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, refuse_batched
 from lcplearn.scenes.contact_kernel.cone import workspace
 from lcplearn.scenes.contact_kernel.element import parts, solve_element
 from lcplearn.scenes.friction_lcp import Problem
