@@ -10,9 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lcplearn.scenes import POSE, Drive, Mode, Trajectory
+from lcplearn.scenes import POSE, Mode, SpatialBody, Trajectory, box_corners
 from lcplearn.scenes.space import rotation_matrix
-from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
 DT = 0.005  # [s]
 HALF = torch.tensor([0.06, 0.05, 0.04], dtype=torch.float64)  # half widths [m]
@@ -29,7 +28,7 @@ def toss(steps: int = 300) -> tuple[SpatialBody, Trajectory]:
     velocity, spin = [1.3, 0.15, 0.6], [3.0, 14.0, 4.0]
     state = torch.tensor([*position, *turn, *velocity, *spin], dtype=torch.float64)
     state[3:7] /= state[3:7].norm()
-    return box, box.rollout(state, Drive(torch.zeros(steps, 6, dtype=torch.float64)))
+    return box, box.rollout(state, torch.zeros(steps, 6, dtype=torch.float64))
 
 
 def draw(box: SpatialBody, path: Trajectory, file: Path, every: int = 5, hold: int = 15) -> None:
