@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lcplearn.datasets import Windows
 from lcplearn.formulations import Formulation, loss_terms
-from lcplearn.training.checkpoint import describe
+from lcplearn.training.checkpoint import describe, plain
 from lcplearn.training.optimizer import Optimizer
 from lcplearn.training.stages import Stage
 
@@ -116,7 +116,7 @@ class FormulationModule(pl.LightningModule):
         """What is trained, what is minimised, and by what, as plain values."""
         last = self.stages[-1]
         objective = {"loss": {name: weight for name, weight in last.loss.items() if weight}, "horizon": last.horizon}
-        return {"formulation": describe(self.model), "objective": objective, "training": self.training_settings}
+        return {"formulation": describe(self.model), "objective": plain(objective), "training": self.training_settings}
 
     @property
     def stage(self) -> Stage:

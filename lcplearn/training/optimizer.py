@@ -41,7 +41,7 @@ class Optimizer:
     def build(self, model: nn.Module) -> list[torch.optim.Optimizer]:
         """Adam, and LBFGS if it is asked for."""
         parameters = [p for p in model.parameters() if p.requires_grad]
-        adam = torch.optim.Adam(parameters, lr=self.lr)
+        adam = torch.optim.Adam(parameters, lr=float(self.lr))
         if self.lbfgs_after is None:
             return [adam]
         # No tolerances: losses of 1e-17 and below are meant. Early stopping ends what no longer improves.
@@ -62,7 +62,7 @@ class Optimizer:
     def learning_rate(self, epoch: int, max_epochs: int) -> float:
         """Adam's learning rate in an epoch."""
         last = max_epochs if self.lbfgs_after is None else min(self.lbfgs_after, max_epochs)
-        return self.lr * 0.5 * (1.0 + math.cos(math.pi * min(epoch / max(last, 1), 1.0)))
+        return float(self.lr) * 0.5 * (1.0 + math.cos(math.pi * min(epoch / max(last, 1), 1.0)))
 
     def temperature(self, epoch: int) -> float:
         """Softening of the stick threshold in an epoch [m/s]."""

@@ -25,8 +25,10 @@ def arguments(given: Mapping[str, Any] | None, epochs: int) -> dict[str, Any]:
     """Keyword arguments of the Trainer: the defaults of this project, and what is given.
 
     Raises:
-        ValueError: another precision than float64, or a GPU that isn't there.
+        ValueError: a number of epochs, another precision than float64, or a GPU that isn't there.
     """
+    if "max_epochs" in (given or {}):
+        raise ValueError("trainer: expected the number of epochs as epochs=, by which stages and rates are planned")
     chosen = {
         "max_epochs": epochs,
         "check_val_every_n_epoch": 10,
@@ -49,10 +51,10 @@ def arguments(given: Mapping[str, Any] | None, epochs: int) -> dict[str, Any]:
 def build(chosen: Mapping[str, Any], folder: Path, callbacks: Sequence[pl.Callback], logger: Any) -> pl.Trainer:
     """Make the Trainer of `arguments`, with callbacks of ours beside those that are chosen."""
     rest = dict(chosen)
-    callbacks = [*callbacks, *rest.pop("callbacks", [])]
+    more, plugins = (rest.pop(name, None) or [] for name in ("callbacks", "plugins"))
+    callbacks = [*callbacks, *(more if isinstance(more, list | tuple) else [more])]
     if rest.get("enable_progress_bar", True):
         callbacks.append(EpochBar())
-    plugins = rest.pop("plugins", None) or []
     plugins = [AtomicCheckpointIO(), *(plugins if isinstance(plugins, list | tuple) else [plugins])]
     with _errors(TypeError):  # of devices=x, for instance
         return pl.Trainer(

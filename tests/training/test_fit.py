@@ -123,6 +123,13 @@ def test_a_model_of_another_time_step_or_gravity_than_the_data_is_refused(tmp_pa
     assert not (tmp_path / "run").exists()
 
 
+def test_epochs_are_asked_for_once(tmp_path: Path) -> None:
+    data = tiny_data()
+    with pytest.raises(ValueError, match=r"^trainer: expected the number of epochs as epochs="):
+        short_fit(Physical(dt=data.dt), data, tmp_path / "run", epochs=200, trainer=QUIET | {"max_epochs": 5})
+    assert not (tmp_path / "run").exists()
+
+
 class Terminate(Callback):
     """Send the signal that a cluster sends, in the first epoch."""
 
@@ -144,7 +151,7 @@ def test_a_training_stopped_by_a_signal_says_how_to_resume_and_loses_nothing(tmp
 
 def test_a_signal_in_the_last_epoch_comes_too_late(tmp_path: Path) -> None:
     data = tiny_data()
-    trainer = QUIET | {"callbacks": [Terminate()]}
+    trainer = QUIET | {"callbacks": Terminate()}
     result = short_fit(Structured(dt=data.dt), data, tmp_path / "run", epochs=1, trainer=trainer)
     assert result.metrics is not None
 
@@ -189,7 +196,8 @@ def test_numbers_that_numpy_computed_come_back_from_checkpoints_and_settings(tmp
     data = tiny_data()
     data = dataclasses.replace(data, dt=np.float64(data.dt))
     model = Physical(dt=data.dt, gravity=np.float64(9.81))
-    short_fit(model, data, tmp_path, epochs=1, optimizer=Optimizer(lr=np.float64(0.1)))
+    optimizer, loss = Optimizer(lr=np.float64(0.1)), {"prediction": np.float64(1.0)}
+    short_fit(model, data, tmp_path, epochs=1, optimizer=optimizer, loss=loss)
     assert load(tmp_path / "best.ckpt").dt == data.dt
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["lr"] == 0.1
 
