@@ -91,7 +91,7 @@ def fit(
         allow_changes: Resume although seed, data, optimizer or batch size have changed; config.yaml then says how.
         seed: Seed of the order of the batches.
         logger: A Lightning logger; none by default.
-        trainer: Further keyword arguments of Lightning's Trainer.
+        trainer: Further keyword arguments of Lightning's Trainer: {"accelerator": "cuda"} trains on a GPU.
         settings: What config.yaml shall say, for `lcplearn.compare`; the arguments of this call by default.
 
     Returns:
