@@ -30,6 +30,17 @@ def _sums(S, at, n, width):
 
 
 @numba.njit
+def _exchange(T, factors, c, row, columns, width):
+    vectors.exchange_columns(T, factors, c, row, columns, width // 4)
+
+
+@numba.njit
+def _first(numbers, bound, width):
+    bits = vectors.at_most(numbers, bound, width // 4)
+    return bits, vectors.first_bit(bits)
+
+
+@numba.njit
 def _powers(x):
     below = vectors.power_below(x)
     return below, vectors.inverse_of_power(below)
@@ -86,6 +97,29 @@ def test_sums_and_ratios_run_over_columns(n):
     expected = np.where(factors < 0, p / np.where(factors < 0, -factors, 1.0), np.inf)
     np.testing.assert_allclose(ratios, expected, rtol=1e-15)
     assert best == ratios.min()
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_an_exchange_adds_multiples_of_a_column_and_leaves_the_factors_in_its_row(n):
+    rng, width = np.random.default_rng(n), int(padded.py_func(n))
+    T = np.zeros((n + 2, width))
+    T[:, :n] = rng.standard_normal((n + 2, n))
+    for c, row in ((0, 0), (n, n - 1), (n // 2, n // 2)):
+        before, factors = T.copy(), rng.standard_normal(n + 2)
+        _exchange(T.ctypes.data, factors.ctypes.data, c, row, n + 2, width)
+        expected = before + factors[:, None] * before[c]
+        expected[c] = factors[c] * before[c]
+        expected[:, row] = factors
+        np.testing.assert_allclose(T, expected, atol=1e-13)
+        assert (T[:, row] == factors).all()
+
+
+def test_bits_say_which_numbers_are_at_most_a_bound():
+    numbers = np.array([3.0, 2.0, 1.0, np.inf, 2.0, 5.0, 1.0, np.inf, *[4.0] * 56])
+    for bound, expected in ((1.0, [2, 6]), (2.0, [1, 2, 4, 6]), (0.5, []), (4.0, [0, 1, 2, 4, 6, *range(8, 64)])):
+        bits, first = _first(numbers.ctypes.data, bound, 64)
+        assert [i for i in range(64) if int(bits) >> i & 1] == expected
+        assert not expected or first == expected[0]
 
 
 @pytest.mark.parametrize("x", [1.0, 1.5, 1.999, 2.0, 3e-300, 8e307 / 2, 2.2250738585072014e-308])

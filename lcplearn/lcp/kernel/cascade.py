@@ -98,7 +98,7 @@ def run_stage(stage, left, budget, accepted, tol, single_precision, q, s, number
     if stage < PATH:
         pivot = prepare_lemke(stage, single_precision, cover)
         cap = left if budget >= 0 else 10 * n + 50
-        ended, count = lemke(S, p, cover, pivot, T, basic, column, place, buffer, x, index, basis, z, cap)
+        ended, count = lemke(S, p, cover, pivot, T, basic, column, place, x, index, basis, z, cap)
     elif stage == PATH:
         count = interior_point(S, p, A, rows, cols, z, w, omega, x, y, v, buffer, min(80, left))
         for i in range(n):
@@ -163,9 +163,7 @@ def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out
         if ended == STUCK and not asked and not accepted:
             asked = True
             margin = 1e-3 if single_precision else 1e-9  # rounding of the data to float32 proves nothing
-            if prove_infeasible(
-                M, q, S, p, r, cover, T, basic, column, place, buffer, x, index, v, margin, 20 * n + 50
-            ):
+            if prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, x, index, v, margin, 20 * n + 50):
                 for i in range(n):
                     u_out[i] = v[i]
                 return INFEASIBLE, best, used

@@ -4,7 +4,7 @@ import numpy as np
 
 from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, LARGEST, STUCK, jit, jit_inline, jit_merged
 from lcplearn.lcp.kernel.memory import address, vector
-from lcplearn.lcp.kernel.vectors import add_product, smallest_ratio
+from lcplearn.lcp.kernel.vectors import add_product, at_most, exchange_columns, first_bit, smallest_ratio
 
 # Equation i says: basic variable = T[n + 1, i] + sum_c T[c, i] * (nonbasic variable of column c), n + 1 columns, stored
 # one after the other: ratio tests and updates then run along contiguous memory (1.3 to 1.5 times as fast). Variables
@@ -46,19 +46,13 @@ def start_tableau(S, p, cover, T, basic, column, place, factor):
 
 
 @jit_inline
-def exchange(T, basic, column, place, row, c, factor, buffer):
+def exchange(T, basic, column, place, row, c, factor):
     """Pivot: the nonbasic variable of column c becomes basic in this row."""
-    rows = T.shape[1]
     inverse = 1.0 / T[c, row]
-    for i in range(rows):
-        buffer[i] = T[c, i]
-        T[c, i] = 0.0
     for j in range(T.shape[0]):
         factor[j] = -inverse * T[j, row]
     factor[c] = inverse
-    add_product(address(T), address(factor), address(buffer), T.shape[0], rows // 4)
-    for j in range(T.shape[0]):  # not before: to load a vector of which a part has just been stored takes long
-        T[j, row] = factor[j]
+    exchange_columns(address(T), address(factor), c, row, T.shape[0], T.shape[1] // 4)
     basic[row], column[c] = column[c], basic[row]
     place[basic[row]], place[column[c]] = row, -1 - c
 
@@ -75,6 +69,10 @@ def leaving_row(T, place, c, tolerance, ratio, tied):
     best += 1e-12 * (1.0 + best)
     if place[2 * n] >= 0 and ratio[place[2 * n]] <= best:  # z_0 leaves whenever it can: this is the solution
         return place[2 * n]
+    if n <= 64:
+        bits = at_most(address(ratio), best, width // 4)
+        if bits & (bits - 1) == 0:
+            return first_bit(bits)
     count = 0
     for i in range(n):
         tied[count] = i
@@ -98,7 +96,7 @@ def leaving_row(T, place, c, tolerance, ratio, tied):
 
 
 @jit_merged
-def lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, basis, z, cap):
+def lemke(S, p, cover, tolerance, T, basic, column, place, ratio, tied, basis, z, cap):
     """Follow Lemke's path until z_0 leaves; z and basis of the last dictionary, how it ended, and the pivots."""
     n = p.size
     row = start_tableau(S, p, cover, T, basic, column, place, ratio)
@@ -111,7 +109,7 @@ def lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, 
             ended = STUCK
             break
         leaving = basic[row]
-        exchange(T, basic, column, place, row, c, ratio, buffer)
+        exchange(T, basic, column, place, row, c, ratio)
         pivots += 1
         if leaving == 2 * n:
             ended = DONE
@@ -123,7 +121,7 @@ def lemke(S, p, cover, tolerance, T, basic, column, place, buffer, ratio, tied, 
 
 
 @jit
-def prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, ratio, tied, u, margin, cap):
+def prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, ratio, tied, u, margin, cap):
     """Minimise z_0 subject to S z + cover z_0 + p >= 0; where the minimum is positive its dual u is Farkas' proof.
 
     At the optimum z_0 = b + u.w + v.z with u, v >= 0 holds identically in z: S'u = -v <= 0 and p.u = -b < 0. In units
@@ -144,7 +142,7 @@ def prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, buffer, rati
         leaving = leaving_row(T, place, c, 1e-11, ratio, tied)
         if leaving < 0 or basic[leaving] == 2 * n:
             return False
-        exchange(T, basic, column, place, leaving, c, ratio, buffer)
+        exchange(T, basic, column, place, leaving, c, ratio)
     largest = 0.0
     for i in range(n):
         u[i] = T[-1 - place[i], place[2 * n]] if place[i] < 0 else 0.0

@@ -76,7 +76,7 @@ def solve_small(P, small, flips, cap, scratch):
         r[i] = c[i] = d[i]
         cover[i] = 1.0
     scale(P, small, r, c, buffer, S, p)
-    ended, count = lemke(S, p, cover, 1e-9, T, basic, column, place, buffer, x, index, flips, z, cap)
+    ended, count = lemke(S, p, cover, 1e-9, T, basic, column, place, x, index, flips, z, cap)
     if ended == STUCK:
         for i in range(m):
             basis[i] = p[i] < 0.0

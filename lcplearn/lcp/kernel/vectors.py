@@ -50,6 +50,9 @@ class _Code:
         vector = self.builder.insert_element(ir.Constant(FOUR, ir.Undefined), value, I32(0))
         return self.shuffle(vector, vector, [0] * 4)
 
+    def splat_integer(self, value: Any) -> Any:
+        return self.builder.bitcast(self.splat(self.builder.bitcast(value, DOUBLE)), BITS)
+
     def magnitude(self, vector: Any) -> Any:
         positive = ir.Constant(BITS, [0x7FFFFFFFFFFFFFFF] * 4)
         return self.builder.bitcast(self.builder.and_(self.builder.bitcast(vector, BITS), positive), FOUR)
@@ -97,6 +100,23 @@ def add_product(v: _Code, builder: Any, target: Any, factors: Any, source: Any, 
         with cgutils.for_range(builder, columns) as column:
             at = builder.gep(start, [builder.mul(column.index, blocks)])
             v.store(v.plus(v.load(at), s, v.splat(v.load(factors, column.index))), at)
+
+
+@_operation("iiiiii")
+def exchange_columns(v: _Code, builder: Any, T: Any, factors: Any, c: Any, row: Any, columns: Any, blocks: Any) -> None:
+    """T[j, i] += factors[j] T[c, i], but T[j, row] = factors[j] and T[c, i] = factors[c] T[c, i]."""
+    T, factors = v.vectors(T), v.doubles(factors)
+    pivots = builder.gep(T, [builder.mul(c, blocks)])
+    with cgutils.for_range(builder, blocks) as block:
+        here = builder.sub(row, builder.mul(block.index, I64(4)))
+        others = builder.icmp_signed("!=", ir.Constant(BITS, list(range(4))), v.splat_integer(here))
+        s = builder.select(others, v.load(pivots, block.index), ir.Constant(FOUR, [1.0] * 4))
+        v.store(ZERO, pivots, block.index)
+        start = builder.gep(T, [block.index])
+        with cgutils.for_range(builder, columns) as column:
+            at = builder.gep(start, [builder.mul(column.index, blocks)])
+            kept = builder.select(others, v.load(at), ZERO)
+            v.store(v.plus(kept, s, v.splat(v.load(factors, column.index))), at)
 
 
 @_operation("iiiiiii")
@@ -252,6 +272,24 @@ def smallest_ratio(v: _Code, builder: Any, slopes: Any, values: Any, ratios: Any
         v.store(ratio, ratios, block.index)
         builder.store(v.choose("<", ratio, builder.load(best)), best)
     return v.across("<", builder.load(best))
+
+
+@_operation("idi", types.int64)
+def at_most(v: _Code, builder: Any, numbers: Any, bound: Any, blocks: Any) -> Any:
+    """Bit i says whether number i is at most the bound; up to 64 of them."""
+    numbers, bound = v.vectors(numbers), v.splat(bound)
+    found = cgutils.alloca_once_value(builder, I64(0))
+    with cgutils.for_range(builder, blocks) as block:
+        bits = builder.bitcast(builder.fcmp_ordered("<=", v.load(numbers, block.index), bound), ir.IntType(4))
+        shift = builder.mul(block.index, I64(4))
+        builder.store(builder.or_(builder.load(found), builder.shl(builder.zext(bits, I64), shift)), found)
+    return builder.load(found)
+
+
+@_operation("i", types.int64)
+def first_bit(v: _Code, builder: Any, bits: Any) -> Any:
+    """The number of the lowest bit that is set."""
+    return builder.cttz(bits, ir.IntType(1)(0))
 
 
 @_operation("d", types.float64)
