@@ -192,6 +192,23 @@ SECOND = [
         ("the mean of a pair of diverged and finite counts", "lcplearn/compare.py",
          "statistics.median_low if worst < 0 else statistics.median_high",
          "statistics.median_high if worst < 0 else statistics.median_low", COMPARE),
+        ("an island's proof is laid on other rows", LCP + "kernel/islands.py", "us[b, rows[a]] = u[a]",
+         "us[b, a] = u[a]", "tests/lcp/test_islands.py"),
+        ("pivots of islands are not added up", LCP + "kernel/islands.py", "used += ended[2]", "used = ended[2]",
+         "tests/lcp/test_islands.py"),
+        ("rows connect only with the first one", LCP + "kernel/islands.py", "M[i, j] != 0.0 and other != own:",
+         "M[i, j] != 0.0 and other != own and i == 0:", "tests/lcp/test_islands.py"),
+        ("islands start from no basis", LCP + "kernel/islands.py", "basis[a] = bases[b, rows[a]]", "basis[a] = False",
+         "tests/lcp/test_islands.py"),
+        ("slices of a sum depend on the threads", LCP + "threads.py", "if not helpers and not summed:",
+         "if not helpers:", "tests/lcp/test_threads.py"),
+        ("a forked process waits for its parent's threads", LCP + "threads.py",
+         "os.register_at_fork(after_in_child=_pool.cache_clear)", "pass", "tests/lcp/test_threads.py"),
+        ("small work wakes threads", LCP + "threads.py", "WORTHWHILE = 0.5e-3", "WORTHWHILE = 0.5e-5",
+         "tests/lcp/test_threads.py"),
+        ("the last vector of a row holds the next row", LCP + "kernel/vectors.py",
+         "return self.keep(self.mask, self.v.load(self.builder.select(row[2], self.rest, inside)))",
+         "return self.v.load(self.builder.select(row[2], self.rest, inside))", "tests/lcp/test_kernel_vectors.py"),
     ]
 ]  # fmt: skip
 
