@@ -286,5 +286,5 @@ def _changes(rows: dict[Value, Row], others: dict[Value, Row]) -> list[str]:
 
 
 def _spread(rows: list[Row], what: str) -> str:
-    values = sorted(float(row[what]) for row in rows)
+    values = sorted(float(row[what]) for row in rows if row[what] == row[what])
     return f"{values[len(values) // 2]:.3g} ({values[0]:.3g} to {values[-1]:.3g})" if values else "-"
