@@ -21,6 +21,7 @@ from lcplearn import __version__
 from lcplearn.training.settings import SettingsError, check
 
 SWEEP = ("-m", "--multirun")
+CONFIG_DIR = re.compile(r"^(?:--config-dir|-cd)[=\n](.+)$", re.MULTILINE)  # in arguments, a line each
 CHECKED = 200  # runs of a sweep; those behind are checked when they start
 
 
@@ -98,6 +99,11 @@ def _link(folder: Path, latest: Path) -> None:
     beside.rename(latest)
 
 
+def own_folders(arguments: Sequence[str]) -> list[Path]:
+    """Folders of settings of the user's own that a command line names."""
+    return [Path(folder) for folder in CONFIG_DIR.findall("\n".join(arguments))]
+
+
 def version_line() -> str:
     """Name and version."""
     return f"lcplearn {__version__}"
@@ -168,7 +174,7 @@ def _new(folder: Path, key: str) -> Path:
 def _search(arguments: Sequence[str]) -> list[str]:
     """Hydra's --config-dir FOLDER as the setting that it stands for, so that what is below it is checked early too."""
     text = "\n".join(arguments)
-    match = re.search(r"^(?:--config-dir|-cd)[=\n](.+)$", text, re.MULTILINE)
+    match = CONFIG_DIR.search(text)
     if match is None:
         return [*arguments]
     folder = Path(match[1])

@@ -125,13 +125,14 @@ def train_pushes(config: DictConfig, data: Any, settings: dict[str, Any], folder
 
 def sentence(error: BaseException) -> str:
     """What a user can do about an error, in one sentence."""
+    from lcplearn.command_line import own_folders
     from lcplearn.training.vocabulary import explain
 
     failed_call = isinstance(error, InstantiationException) and error.__cause__ is not None
     cause = error.__cause__ if failed_call else error
     if isinstance(cause, OSError) and cause.filename and cause.strerror:
         return f"{cause.filename}: {cause.strerror}."
-    return explain(str(cause) or "Stopped.", CONF)
+    return explain(str(cause) or "Stopped.", CONF, own_folders(sys.argv))
 
 
 def command(arguments: list[str]) -> None:

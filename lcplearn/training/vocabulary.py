@@ -15,12 +15,13 @@ FROM_DATA = {"dt", "gravity", "space", "given", "vertices", "com"}  # of a model
 UNLIKELY = {"min_epochs"}  # what nobody means who writes something alike
 
 
-def explain(message: str, conf: Path) -> str:
+def explain(message: str, conf: Path, own: Iterable[Path] = ()) -> str:
     """Turn Hydra's message about a mistyped override into one sentence with a suggestion.
 
     Args:
         message: Text of Hydra's error.
         conf: Folder of the configuration.
+        own: Folders of the user's, whose settings may have been meant too.
     """
     named = re.search(r"Could not override '([\w.@/]+)'", message)
     missing = re.search(r"Could not find '([\w./]+)/([\w.-]+)'", message)
@@ -39,7 +40,8 @@ def explain(message: str, conf: Path) -> str:
             return unknown(key, conf)
         if key in in_files:
             return f"'{named[1]}' is a setting of another {group}= than the chosen one."
-        return f"Unknown setting '{named[1]}'; {suggestion(key, in_files | in_code, f'{group}.')}"
+        theirs = {name for folder in own for names in vocabulary(folder, group) for name in names}
+        return f"Unknown setting '{named[1]}'; {suggestion(key, in_files | in_code | theirs, f'{group}.')}"
     several = re.search(r"Ambiguous value for argument '([^']+)'", message)
     if several:
         return f"{several[1]} are several values: -m before the settings trains one run after the other."

@@ -10,7 +10,7 @@ import pytest
 from hydra.errors import HydraException
 from real_data import real_data
 
-from lcplearn.command_line import prepare
+from lcplearn.command_line import own_folders, prepare
 from lcplearn.lcp import methods, solve
 from lcplearn.train import CONF
 from lcplearn.training.settings import SettingsError
@@ -129,3 +129,7 @@ def test_own_configuration_is_found_and_checked(tmp_path):
     with pytest.raises(HydraException) as error:
         prepare(["--config-dir=extending/conf", "model=clipd"], CONF)
     assert explain(str(error.value), CONF) == "There is no model=clipd; did you mean 'clipped'?"
+    with pytest.raises(HydraException) as error:
+        prepare(["--config-dir=extending/conf", "data=ramp", "data.outlierz=1"], CONF)
+    meant = explain(str(error.value), CONF, own_folders(["--config-dir=extending/conf"]))
+    assert meant == "Unknown setting 'data.outlierz'; did you mean 'data.outliers'?"
