@@ -33,7 +33,7 @@ def test_a_cache_folder_that_cannot_be_written_to_costs_no_solve(monkeypatch):
 
 @pytest.mark.parametrize("offset", [0, 8, 40, 56])
 def test_arrays_of_an_element_lie_apart_within_its_memory_whatever_its_alignment(offset):
-    for n in (0, 1, 2, 3, 5, 8, 13, 24, 101):
+    for n in (0, 1, 2, 3, 5, 8, 13, 24, 101, 128, 141):
         memory = np.empty(scratch_size.py_func(n) + 8)
         start = memory.ctypes.data - memory.ctypes.data % 64 + offset
         arrays = [x for group in workspace(start, n) for x in group]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, LARGEST, STUCK, jit, jit_inline, jit_merged
-from lcplearn.lcp.kernel.memory import address, vector
+from lcplearn.lcp.kernel.memory import address, padded, vector
 from lcplearn.lcp.kernel.vectors import add_product, at_most, exchange_columns, first_bit, smallest_ratio
 
 # Equation i says: basic variable = T[n + 1, i] + sum_c T[c, i] * (nonbasic variable of column c), n + 1 columns, stored
@@ -32,9 +32,14 @@ def start_tableau(S, p, cover, T, basic, column, place, factor):
     width = T.shape[1]
     for i in range(n, width):
         T[n, i] = T[n + 1, i] = 0.0
-    columns, entries = vector(address(T), n * width), vector(address(S), n * width)
-    for k in range(n * width):
-        columns[k] = entries[k]
+    if width == S.shape[1]:
+        columns, entries = vector(address(T), n * width), vector(address(S), n * width)
+        for k in range(n * width):
+            columns[k] = entries[k]
+    else:
+        for j in range(n):
+            for i in range(width):
+                T[j, i] = S[j, i] if i < S.shape[1] else 0.0
     for j in range(n):
         factor[j] = -S[j, row]
     add_product(address(T), address(factor), address(T) + 8 * n * width, n, width // 4)
@@ -63,7 +68,7 @@ def leaving_row(T, place, c, tolerance, ratio, tied):
     n = T.shape[0] - 2
     width = T.shape[1]
     values = address(T) + 8 * (n + 1) * width
-    best = smallest_ratio(address(T) + 8 * c * width, values, address(ratio), tolerance, width // 4)
+    best = smallest_ratio(address(T) + 8 * c * width, values, address(ratio), tolerance, padded(n) // 4)
     if best == np.inf:
         return -1
     best += 1e-12 * (1.0 + best)
