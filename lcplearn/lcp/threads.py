@@ -51,19 +51,20 @@ def in_slices(task: Callable[[int, int], Result], count: int, size: int, *, summ
         return taken
 
     helpers = _start(work, min(torch.get_num_threads(), int(len(slices) * SLICE / WORTHWHILE)) - 1)
-    if not helpers and not summed:
+    if not helpers and not summed and not results:
         return [task(0, count)]
     begun, taken = time.perf_counter(), 0
     try:
         taken = work()
     finally:
+        slices.clear()  # after an exception, Ctrl-C say, nobody shall go on
         done = time.perf_counter()
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
     if helpers:
         _pause.after((time.perf_counter() - done) * taken > LATE * (done - begun))
-    return [results[start] for start in sorted(results)]
+    return [results[start] for start in range(0, count, size)]
 
 
 class _Pause:
@@ -85,12 +86,17 @@ _pause = _Pause()
 
 
 def _start(work: Callable[[], int], count: int) -> list["Future[int]"]:
+    helpers: list[Future[int]] = []
     if count < 1 or not _pause.over():
-        return []
+        return helpers
+    pool = _pool()
     try:
-        return [_pool().submit(work) for _ in range(count)]
-    except RuntimeError:  # Python is about to end, and starts no thread any more
-        return []
+        for _ in range(count):
+            helpers.append(pool.submit(work))
+    except RuntimeError:  # Python is about to end, or the system has no thread left
+        _pool.cache_clear()
+        pool.shutdown(cancel_futures=True)  # waits: work that was queued before its thread failed could be taken unseen
+    return helpers
 
 
 @cache

@@ -2,7 +2,9 @@
 
 import multiprocessing
 import threading
-from concurrent.futures import Future, ProcessPoolExecutor
+import time
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import cache
 
 import pytest
 import torch
@@ -87,12 +89,56 @@ class _EndedPool:
     def submit(self, _):
         raise RuntimeError("cannot schedule new futures after interpreter shutdown")
 
+    def shutdown(self, cancel_futures):
+        pass
+
 
 @pytest.mark.parametrize("pool", [_LatePool(), _EndedPool()])
 def test_what_a_thread_has_not_begun_the_caller_does(monkeypatch, pool):
     torch.set_num_threads(2)
-    monkeypatch.setattr(threads, "_pool", lambda: pool)
+    monkeypatch.setattr(threads, "_pool", cache(lambda: pool))
     assert threads.in_slices(lambda *ends: ends, 10, 1, summed=True) == [(k, k + 1) for k in range(10)]
+
+
+@pytest.mark.parametrize("summed", [False, True])
+def test_where_the_system_starts_no_more_threads_each_slice_is_still_done_once(monkeypatch, summed):
+    """The pool queues work before it starts a thread for it, and that work is done if another thread has time."""
+    torch.set_num_threads(3)
+    pool = ThreadPoolExecutor(3)
+    monkeypatch.setattr(threads, "_pool", cache(lambda: pool))
+    start, begun, taken = threading.Thread.start, [], []
+
+    def start_one(thread):
+        if begun:
+            raise RuntimeError("can't start new thread")
+        begun.append(thread)
+        start(thread)
+
+    def task(first, stop):
+        taken.append((first, stop))
+        time.sleep(0.01)
+        return first
+
+    monkeypatch.setattr(threading.Thread, "start", start_one)
+    assert threads.in_slices(task, 16, 1, summed=summed) == list(range(16))
+    assert sorted(taken) == [(k, k + 1) for k in range(16)]
+
+
+def test_after_an_error_nobody_takes_another_slice():
+    torch.set_num_threads(2)
+    main, taken, together = threading.get_ident(), [], threading.Barrier(2, timeout=20.0)
+
+    def task(start, _):
+        taken.append(start)
+        if len(taken) <= 2:
+            together.wait()
+        if threading.get_ident() == main:
+            raise KeyboardInterrupt
+        time.sleep(0.1)  # until the error has got through
+
+    with pytest.raises(KeyboardInterrupt):
+        threads.in_slices(task, 16, 1)
+    assert len(taken) == 2
 
 
 def test_a_thread_that_is_alone_takes_all_at_once_but_for_sums():
