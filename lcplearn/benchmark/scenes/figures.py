@@ -86,7 +86,7 @@ def error_time(scene: str, rows: Sequence[Row]) -> "Figure":
 CONE_LOOKS = (Style(GREEN, "^"), Style(BLUE, "o"), Style(SKY, "v", "--"), Style(RED, "s", ":"))
 
 
-def cone_bars(rows: Sequence[Row], limit: float) -> "Figure":
+def cone_lines(rows: Sequence[Row], limit: float) -> "Figure":
     """Distance from the exact cone against time of a step, a point a batch; in units of the friction limit."""
     figure, axes = new_figure(width=6.5, height=4.2)
     box = [row for row in rows if row["scene"] == "box in space"]

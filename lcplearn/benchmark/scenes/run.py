@@ -21,7 +21,7 @@ from lcplearn.benchmark.scenes.cases import (
 )
 from lcplearn.benchmark.scenes.compiled import COMPILED, compiled_rows
 from lcplearn.benchmark.scenes.contact_cases import CURVED, DT, MU, body_rows, body_scenes, curve_rows
-from lcplearn.benchmark.scenes.figures import cone_bars, curve_lines, error_time, time_bars
+from lcplearn.benchmark.scenes.figures import cone_lines, curve_lines, error_time, time_bars
 from lcplearn.benchmark.scenes.fused import WHAT, fused_rows
 
 KEY = ("part", "scene", "dt", "batch")
@@ -218,7 +218,7 @@ def _say_bodies(study: Study) -> None:
         "Random states that touch the ground, one step: rows of all corners and those that a step needs (mean), "
         f"rms distance of the velocity from that of the exact cone (mu g dt is {MU * 9.81 * DT:.3g} m/s), CPU time.",
         table=Table(heads, [tuple(row[column] for column in columns) for row in bodies]),
-        figure=cone_bars(bodies, MU * 9.81 * DT),
+        figure=cone_lines(bodies, MU * 9.81 * DT),
     )
     fused = [row for row in study.rows if row["part"] == "fused"]
     study.say(
