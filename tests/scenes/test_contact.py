@@ -34,7 +34,7 @@ def test_what_the_needed_rows_give_solves_the_law_of_all_contacts(seed):
     for scene in (polygons(30, seed), boxes(30, seed), boxes(30, seed, compliance=1e-3)):
         step = contact_step(*scene, DT, rest=False)  # which writes 0 for a velocity that compliance leaves
         right, wrong = step.solved & step.settled, violation(*scene, step)
-        assert (right & (wrong < 1e-12)).sum() >= 29  # of a million boxes one does not settle, two to 5e-11 only
+        assert (right & (wrong < 1e-12)).sum() >= 29  # of a million boxes one does not settle, nine to 6e-10 only
         assert wrong[right].amax() < 1e-9
 
 
