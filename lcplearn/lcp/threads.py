@@ -19,7 +19,7 @@ WORTHWHILE = 0.5e-3  # work of a thread [s]: to wake one takes 20 to 30 microsec
 SLICE = 0.125e-3  # work of a slice [s]
 MOST_SLICES = 256
 LATE = 2.0  # slices for which a helper's last one is waited: more means that the machine has other work
-LONGEST_PAUSE = 63  # calls without helpers, before they are tried again
+PAUSE = 20.0  # times what was waited for a late helper, without any: so they cost a twentieth at most
 
 
 def slice_size(count: int, seconds: float) -> int:
@@ -62,24 +62,22 @@ def in_slices(task: Callable[[int, int], Result], count: int, size: int, *, summ
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
-    if helpers:
-        _pause.after((time.perf_counter() - done) * taken > LATE * (done - begun))
+    waited = time.perf_counter() - done
+    if helpers and waited * taken > LATE * (done - begun):
+        _pause.after(waited)
     return [results[start] for start in range(0, count, size)]
 
 
 class _Pause:
-    """Calls to go without helpers. Where these come late, each pause is twice as long as the one before."""
+    """Until when this thread works alone, as helpers came late."""
 
-    def __init__(self) -> None:
-        self.length = self.left = 0
+    end = 0.0
+
+    def after(self, waited: float) -> None:
+        self.end = time.perf_counter() + PAUSE * waited
 
     def over(self) -> bool:
-        self.left -= 1
-        return self.left < 0
-
-    def after(self, late: bool) -> None:
-        self.length = min(2 * self.length + 1, LONGEST_PAUSE) if late else 0
-        self.left = self.length
+        return time.perf_counter() >= self.end
 
 
 _pause = _Pause()

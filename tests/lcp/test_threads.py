@@ -18,7 +18,7 @@ from lcplearn.lcp import pivoting, threads
 @pytest.fixture(autouse=True)
 def _threads():
     before = torch.get_num_threads()
-    threads._pause.after(late=False)
+    threads._pause.end = 0.0
     yield
     torch.set_num_threads(before)
 
@@ -162,16 +162,22 @@ def test_an_error_on_another_thread_reaches_the_caller():
         threads.in_slices(task, 16, 1)
 
 
-def test_threads_that_come_late_are_left_alone_for_twice_as_many_calls_each_time():
-    pause = threads._Pause()
-    waits = []
-    for late in (True, True, True, False, False):
-        pause.after(late)
-        calls = 0
-        while not pause.over():
-            calls += 1
-        waits.append(calls)
-    assert waits == [1, 3, 7, 0, 0]
+def test_after_a_late_thread_none_is_asked_for_twenty_times_as_long(monkeypatch):
+    torch.set_num_threads(2)
+    main, begun = threading.get_ident(), threading.Event()
+
+    def task(start, stop):
+        if threading.get_ident() != main:
+            begun.set()
+            time.sleep(0.05)
+        begun.wait(30.0)
+
+    before = time.perf_counter()
+    threads.in_slices(task, 16, 1)
+    assert before + 20 * 0.04 < threads._pause.end
+    assert threads.in_slices(lambda *ends: ends, 16, 1) == [(0, 16)]
+    monkeypatch.setattr(threads._pause, "end", 0.0)
+    assert len(threads.in_slices(lambda *ends: ends, 16, 1)) == 16
 
 
 @pytest.mark.slow
