@@ -361,8 +361,8 @@ def test_the_compiled_rollout_and_its_gradient_are_those_of_torch(law, inertia, 
         assert torch.equal(without.rollout(tossed(count, seed=5), Drive(push)).positions, path.positions)
     monkeypatch.setattr("lcplearn.scenes.spatial_body.compiled_contacts", lambda device: None)
     reference, expected = outcome()
-    torch.testing.assert_close(path.positions, reference.positions, rtol=0, atol=1e-10)
-    torch.testing.assert_close(path.velocities, reference.velocities, rtol=0, atol=1e-9)
+    torch.testing.assert_close(path.positions, reference.positions, rtol=0, atol=1e-12)
+    torch.testing.assert_close(path.velocities, reference.velocities, rtol=0, atol=4e-12)
     assert (path.mode == reference.mode).all()
     assert (path.solved == reference.solved).all()
     for found, wanted in zip(gradients, expected, strict=True):
