@@ -37,7 +37,7 @@ def arbitrary_problems(draw):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@settings(deadline=None)
+@settings(deadline=None, max_examples=2 * settings.default.max_examples)
 @given(problem=semidefinite_problems())
 def test_semidefinite_problem_is_solved_exactly_when_enumeration_finds_a_solution(method, problem):
     M, q = problem
