@@ -18,8 +18,8 @@ Result = TypeVar("Result")
 WORTHWHILE = 0.5e-3  # work of a thread [s]: to wake one takes 20 to 30 microseconds
 SLICE = 0.125e-3  # work of a slice [s]
 MOST_SLICES = 256
-LATE = 2.0  # slices for which a helper's last one is waited: more means that the machine has other work
-PAUSE = 20.0  # times what was waited for a late helper, without any: so they cost a twentieth at most
+LATE = 2.0  # slices in whose time this thread may be without a core: more means that the machine has other work
+PAUSE = 20.0  # times what was lost by that, without helpers: so they cost a twentieth at most
 
 
 def slice_size(count: int, seconds: float) -> int:
@@ -53,28 +53,28 @@ def in_slices(task: Callable[[int, int], Result], count: int, size: int, *, summ
     helpers = _start(work, min(torch.get_num_threads(), int(len(slices) * SLICE / WORTHWHILE)) - 1)
     if not helpers and not summed and not results:
         return [task(0, count)]
-    begun, taken = time.perf_counter(), 0
+    taken, begun, used = 0, time.perf_counter(), time.thread_time()
     try:
         taken = work()
     finally:
         slices.clear()  # after an exception, Ctrl-C say, nobody shall go on
-        done = time.perf_counter()
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
-    waited = time.perf_counter() - done
-    if helpers and waited * taken > LATE * (done - begun):
-        _pause.after(waited)
+    used = time.thread_time() - used
+    lost = time.perf_counter() - begun - used  # to a helper that came late, or that took this thread's core
+    if helpers and lost * taken >= LATE * used:
+        _pause.after(lost)
     return [results[start] for start in range(0, count, size)]
 
 
 class _Pause:
-    """Until when this thread works alone, as helpers came late."""
+    """Until when a thread works alone, as helpers cost more than they gained."""
 
     end = 0.0
 
-    def after(self, waited: float) -> None:
-        self.end = time.perf_counter() + PAUSE * waited
+    def after(self, lost: float) -> None:
+        self.end = time.perf_counter() + PAUSE * lost
 
     def over(self) -> bool:
         return time.perf_counter() >= self.end
