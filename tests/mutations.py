@@ -196,6 +196,8 @@ SECOND = [
          "us[b, a] = u[a]", "tests/lcp/test_islands.py"),
         ("pivots of islands are not added up", LCP + "kernel/islands.py", "used += ended[2]", "used = ended[2]",
          "tests/lcp/test_islands.py"),
+        ("single rows need no pivot of the budget", LCP + "kernel/islands.py", "if not easy and used == budget:",
+         "if False:", "tests/lcp/test_islands.py"),
         ("rows connect only with the first one", LCP + "kernel/islands.py", "M[i, j] != 0.0 and other != own:",
          "M[i, j] != 0.0 and other != own and i == 0:", "tests/lcp/test_islands.py"),
         ("islands start from no basis", LCP + "kernel/islands.py", "basis[a] = bases[b, rows[a]]", "basis[a] = False",

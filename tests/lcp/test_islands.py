@@ -140,6 +140,26 @@ def test_a_budget_of_pivots_is_that_of_the_whole():
         assert int(short.iterations) <= budget
 
 
+def test_single_rows_need_a_pivot_each():
+    n = 2 * FEWEST_ROWS
+    M, q = torch.eye(n), -torch.ones(n)
+    short, enough = (solve_lcp(M, q, max_iter=budget) for budget in (n - 1, n))
+    assert int(short.status) == Status.MAX_ITERATIONS
+    assert int(short.iterations) == n - 1
+    assert enough.solved
+
+
+@pytest.mark.parametrize("status", [Status.INFEASIBLE, Status.MAX_ITERATIONS])
+def test_the_residual_of_what_is_not_solved_is_that_of_its_z_or_infinite(status):
+    M, q, rows, _ = random_blocks(1)
+    if status is Status.INFEASIBLE:
+        M[0, rows[2]], q[0, rows[2]] = 0.0, -1.0
+    solution = solve_lcp(M, q, max_iter=5 if status is Status.MAX_ITERATIONS else None)
+    assert int(solution.status) == status
+    own = float(judge(M, q, solution.z, tol=1e-10).residual)
+    assert float(solution.residual) in (pytest.approx(own), float("inf"))
+
+
 def test_islands_start_from_the_initial_basis():
     M, q, _, blocks = random_blocks(2)
     solution = solve_lcp(M, q)

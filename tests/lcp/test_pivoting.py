@@ -293,6 +293,14 @@ def test_solution_beyond_the_range_of_doubles_is_not_solved():
     assert solve([[1e-300]], [-1.0]).z[0, 0] == pytest.approx(1e300)
 
 
+@pytest.mark.parametrize("budget", [10, 20, 40])
+def test_no_problem_takes_more_iterations_than_max_iter(budget):
+    generator = torch.Generator().manual_seed(0)
+    M = torch.randint(-2, 3, (4000, 4, 4), generator=generator).double()
+    q = torch.randint(-2, 3, (4000, 4), generator=generator).double()
+    assert solve(M, q, max_iter=budget).iterations.max() <= budget
+
+
 def test_stopped_by_max_iter_is_reported_and_more_iterations_solve_it():
     M, q, _ = problems.stacked_cubes(np.random.default_rng(6), 20)
     hard = solve(M, q).iterations > 10

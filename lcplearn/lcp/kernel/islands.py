@@ -9,6 +9,7 @@ for the whole problem to say.
 from typing import Any
 
 import numba
+import numpy as np
 
 from lcplearn.lcp.kernel.calling import call
 from lcplearn.lcp.kernel.jit import (
@@ -156,7 +157,9 @@ def _make(sources: str) -> Any:
                     q[a], z[a], w[a], u[a], basis[a] = qs[b, i], 0.0, qs[b, i], 0.0, False
                     easy = easy and q[a] >= 0.0
                 found[0], ended[1], ended[2] = 0.0, SOLVED, 0
-                if not easy and m == 1:
+                if not easy and used == budget:
+                    ended[1] = MAX_ITERATIONS
+                elif not easy and m == 1:
                     z[0], w[0], ended[1] = solve_single(M[island, island], q[0])
                     u[0], basis[0], ended[2] = 1.0, ended[1] == SOLVED, 1
                 elif not easy:
@@ -193,7 +196,7 @@ def _make(sources: str) -> Any:
                 iterations[b] += used
                 unsolved += statuses[b] == UNSOLVED
                 continue
-            residuals[b], statuses[b], iterations[b] = residual, status, used
+            residuals[b], statuses[b], iterations[b] = residual if status == SOLVED else np.inf, status, used
             for i in range(n):
                 bases[b, i] = status == SOLVED and basis_all[i] != 0
                 if status == SOLVED:

@@ -80,7 +80,8 @@ def solve_small(P, small, flips, cap, scratch):
     if ended == STUCK:
         for i in range(m):
             basis[i] = p[i] < 0.0
-        ended, rounds = block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, 20)
+        left = min(20, cap - count)
+        ended, rounds = block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, left)
         count += rounds
         if ended == DONE:
             for i in range(m):
