@@ -94,7 +94,10 @@ def solve_batch(
             left = solve_islands(solver_address(), *problem, scratch, memory, *fields)
         return left
 
-    unsolved = sum(in_slices(solve, count, slice_size(count, count * _seconds(n))))
+    size = slice_size(count, count * _seconds(n))
+    if size < count:
+        solve(0, 0)  # compiles or loads: else threads would wait for that, and seem late
+    unsolved = sum(in_slices(solve, count, size))
     return LCPSolution(z, w, basis, status, residual, iterations, certificate), unsolved
 
 
@@ -154,6 +157,8 @@ def solve_adjoint(
     size = slice_size(count, ADJOINT_SHARE * count * _seconds(n))
     if summed:
         size = max(size, n)  # the sums of slices then take no more memory than q
+    if size < count:
+        solve(0, 0)  # as in `solve_batch`
     for part in in_slices(solve, count, size, summed=summed):
         grad_M = part if grad_M is None else grad_M if part is None else grad_M + part
     return grad_M, grad_q

@@ -20,6 +20,7 @@ SLICE = 0.125e-3  # work of a slice [s]
 MOST_SLICES = 256
 LATE = 2.0  # slices in whose time this thread may be without a core: more means that the machine has other work
 PAUSE = 20.0  # times what was lost by that, without helpers: so they cost a twentieth at most
+LONGEST_PAUSE = 60.0  # [s]; the process may have been stopped meanwhile
 
 
 def slice_size(count: int, seconds: float) -> int:
@@ -74,7 +75,7 @@ class _Pause:
     end = 0.0
 
     def after(self, lost: float) -> None:
-        self.end = time.perf_counter() + PAUSE * lost
+        self.end = time.perf_counter() + min(PAUSE * lost, LONGEST_PAUSE)
 
     def over(self) -> bool:
         return time.perf_counter() >= self.end

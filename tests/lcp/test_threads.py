@@ -180,6 +180,29 @@ def test_after_a_late_thread_none_is_asked_for_twenty_times_as_long(monkeypatch)
     assert len(threads.in_slices(lambda *ends: ends, 16, 1)) == 16
 
 
+def test_to_wait_for_the_compiler_is_not_to_be_late(monkeypatch):
+    torch.set_num_threads(2)
+    compiles, lock, compiled = pivoting.solve_range, threading.Lock(), []
+
+    def slow_at_first(*arguments):
+        with lock:
+            if not compiled:
+                compiled.append(True)
+                time.sleep(0.5)
+        return compiles(*arguments)
+
+    monkeypatch.setattr(pivoting, "solve_range", slow_at_first)
+    q = -torch.ones(40_000, 6)
+    assert solve_lcp(torch.eye(6), q).solved.all()
+    assert threads._pause.end < time.perf_counter() + 20 * 0.5 - 2.0
+
+
+def test_no_pause_is_longer_than_a_minute(monkeypatch):
+    monkeypatch.setattr(threads._pause, "end", 0.0)
+    threads._pause.after(3600.0)
+    assert threads._pause.end <= time.perf_counter() + 60.0
+
+
 @pytest.mark.slow
 def test_a_forked_process_has_threads_of_its_own_after_its_parent_has_used_some():
     assert threads_of_two_slices() == 2
