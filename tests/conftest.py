@@ -16,3 +16,11 @@ def pytest_configure(config: pytest.Config) -> None:
         settings.load_profile("quick")
     else:
         install_import_hook(CHECKED, "beartype.beartype")  # it makes the tests take twice as long
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> None:
+    """As there is a worker for each core, threads of torch beside them would wait for one another, at full load."""
+    import torch  # not before: who only hands tests to workers has no need of it
+
+    torch.set_num_threads(1)
