@@ -67,14 +67,14 @@ def test_small_work_wakes_no_thread(monkeypatch):
     monkeypatch.setattr(threads, "_pool", pool)
     torch.set_num_threads(2)
     generator = torch.Generator().manual_seed(0)
-    M = random_family("positive definite", 200, 8, generator)
+    M = random_family("positive definite", 1000, 8, generator)  # nearly a millisecond
     q = planted(M, generator)[0].requires_grad_()
     solve_lcp(M, q).z.sum().backward()
-    large = M.repeat(20, 1, 1)
+    large = M.repeat(4, 1, 1)
     with pytest.raises(AssertionError, match="a pool was asked for"):
-        solve_lcp(large, q.detach().repeat(20, 1))
+        solve_lcp(large, q.detach().repeat(4, 1))
     torch.set_num_threads(1)
-    solve_lcp(large, q.detach().repeat(20, 1))
+    solve_lcp(large, q.detach().repeat(4, 1))
 
 
 class _LatePool:
@@ -122,6 +122,24 @@ def test_where_the_system_starts_no_more_threads_each_slice_is_still_done_once(m
     monkeypatch.setattr(threading.Thread, "start", start_one)
     assert threads.in_slices(task, 16, 1, summed=summed) == list(range(16))
     assert sorted(taken) == [(k, k + 1) for k in range(16)]
+
+
+def test_work_whose_thread_could_not_be_started_is_not_done_unseen(monkeypatch):
+    torch.set_num_threads(2)
+    pool, taken = ThreadPoolExecutor(2), []
+    pool.submit(time.sleep, 0.05)  # so that its only thread has no time yet
+    monkeypatch.setattr(threads, "_pool", cache(lambda: pool))
+
+    def no_more(_):
+        raise RuntimeError("can't start new thread")
+
+    def task(*_):
+        taken.append(threading.get_ident())
+        time.sleep(0.01)
+
+    monkeypatch.setattr(threading.Thread, "start", no_more)
+    threads.in_slices(task, 16, 1, summed=True)
+    assert taken == 16 * [threading.get_ident()]
 
 
 def test_after_an_error_nobody_takes_another_slice():
