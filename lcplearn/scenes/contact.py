@@ -13,11 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lcplearn.lcp.methods import pivoting_kernel
-from lcplearn.lcp.torch_internals import forward_mode, traced, transformed
 from lcplearn.scenes.contact_solve import solve
 from lcplearn.scenes.friction_lcp import Problem
-from lcplearn.scenes.numbers import common_batch, one_batch
+from lcplearn.scenes.numbers import common_batch, compiled_code_may_see, one_batch
 from lcplearn.scenes.scene import Mode
 
 RestitutionLaw = Literal["newton", "continuous"]
@@ -176,8 +174,8 @@ def _in_torch(problem: Problem, polygon: int | None, rest: bool) -> ContactStep:
 
 
 def compiled_contacts(device: torch.device) -> ModuleType | None:
-    """`contact_kernel.steps`, imported on first use; None off the CPU, without numba, traced or in forward mode."""
-    if device.type != "cpu" or traced() or transformed() or forward_mode() or pivoting_kernel() is None:
+    """`contact_kernel.steps`, imported on first use; None where it may not see the numbers."""
+    if not compiled_code_may_see(device):
         return None
     from lcplearn.scenes.contact_kernel import steps
 

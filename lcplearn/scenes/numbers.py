@@ -1,10 +1,18 @@
-"""Parameters of scenes: plain numbers, or tensors that broadcast over the batch."""
+"""Parameters of scenes: plain numbers, or tensors that broadcast over the batch; and who may look at them."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lcplearn.lcp.methods import pivoting_kernel
+from lcplearn.lcp.torch_internals import forward_mode, traced, transformed
+
 Number = float | Tensor  # a tensor may need a gradient
+
+
+def compiled_code_may_see(device: torch.device) -> bool:
+    """Whether numbers there are plain memory: on the CPU, not traced, mapped or in forward mode; and numba is there."""
+    return device.type == "cpu" and not (traced() or transformed() or forward_mode()) and pivoting_kernel() is not None
 
 
 def as_tensor(value: Number, like: Tensor) -> Tensor:

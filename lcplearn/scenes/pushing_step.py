@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 import lcplearn
-from lcplearn.lcp.methods import pivoting_kernel
-from lcplearn.lcp.torch_internals import forward_mode, traced, transformed
+from lcplearn.scenes.numbers import compiled_code_may_see
 from lcplearn.scenes.pushing_lcp import Bearing, Touch, aligned_lcp
 from lcplearn.scenes.scene import Mode
 
@@ -76,10 +75,8 @@ def settle_by_lcp(bearing: Bearing, touch: Touch, slip: Tensor, *, creep: float,
 
 
 def compiled_pushing(x: Tensor) -> ModuleType | None:
-    """`pushing_node`, imported on first use; None where numba is not there or may not look at the numbers."""
-    if x.device.type != "cpu" or x.dtype != torch.float64 or traced() or transformed() or forward_mode():
-        return None
-    if pivoting_kernel() is None:
+    """`pushing_node`, imported on first use; None where it may not see the numbers, or they are not float64."""
+    if x.dtype != torch.float64 or not compiled_code_may_see(x.device):
         return None
     from lcplearn.scenes import pushing_node
 
