@@ -207,14 +207,8 @@ def _islands(rng: Generator, B: int) -> Case:
     """Problems side by side in one, and rows that do nothing, in any order."""
     kinds = (_p_dense, _semidefinite, _half_integers, _friction_2d, _friction_3d, _nearly_at_rest)
     parts = [kinds[rng.integers(len(kinds))](rng, B) for _ in range(rng.integers(2, 6))]
-    idle = int(rng.integers(0, 20))
-    n = sum(part.q.shape[1] for part in parts) + idle
-    M, q = np.tile(np.eye(n), (B, 1, 1)), np.ones((B, n))
-    start = 0
-    for part in parts:
-        rows = slice(start, start := start + part.q.shape[1])
-        M[:, rows, rows], q[:, rows] = part.M, part.q
-    order = rng.permutation(n)
+    M, q, _ = families.side_by_side([(part.M, part.q) for part in parts], idle=int(rng.integers(0, 20)))
+    order = rng.permutation(q.shape[1])
     return Case(M[:, order][:, :, order], q[:, order])
 
 

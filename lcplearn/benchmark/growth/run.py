@@ -31,11 +31,7 @@ ASYMPTOTIC = 96  # from here on the fixed costs of a problem no longer show
 
 def separate_cubes(rng: np.random.Generator, B: int, cubes: int) -> Problems:
     """Cubes that lie beside one another: M is block diagonal."""
-    alone = [families.stacked_cubes(rng, B) for _ in range(cubes)]
-    M = np.zeros((B, CUBE * cubes, CUBE * cubes))
-    for k, cube in enumerate(alone):
-        M[:, CUBE * k : CUBE * (k + 1), CUBE * k : CUBE * (k + 1)] = cube.M
-    return Problems(M, np.concatenate([cube.q for cube in alone], axis=1), None)
+    return families.side_by_side([families.stacked_cubes(rng, B)[:2] for _ in range(cubes)])
 
 
 CASES: dict[str, tuple[Callable[[np.random.Generator, int, int], Problems], tuple[int, ...]]] = {

@@ -10,7 +10,7 @@ from torch import Tensor
 from lcplearn import solve_lcp
 from lcplearn.benchmark.harness.measuring import interleave, peak_memory
 from lcplearn.benchmark.harness.study import Options, Row, Study, Table
-from lcplearn.benchmark.problems.families import RANDOM_FAMILIES, positive_definite, stacked_cubes
+from lcplearn.benchmark.problems.families import RANDOM_FAMILIES, positive_definite, side_by_side, stacked_cubes
 from lcplearn.lcp.gradient import adjoint
 
 COLUMNS = (
@@ -120,13 +120,8 @@ def problems_of_parts(case: str, repeats: int) -> Row:
     cubes, idle = PARTS[case]
     batch = BATCH // (8 * cubes)
     M, q, _ = stacked_cubes(np.random.default_rng(0), batch * cubes)
-    n = q.shape[1]
-    whole = np.tile(np.eye(cubes * n + idle), (batch, 1, 1))
-    whole_q = np.ones((batch, cubes * n + idle))
-    for cube in range(cubes):
-        rows = slice(cube * n, cube * n + n)
-        whole[:, rows, rows], whole_q[:, rows] = M[cube::cubes], q[cube::cubes]
-    together, alone = tuple(map(torch.from_numpy, (whole, whole_q))), tuple(map(torch.from_numpy, (M, q)))
+    whole = side_by_side([(M[cube::cubes], q[cube::cubes]) for cube in range(cubes)], idle)
+    together, alone = tuple(map(torch.from_numpy, whole[:2])), tuple(map(torch.from_numpy, (M, q)))
     calls: dict[str, Callable[[], Any]] = {
         "forward": lambda: solve_lcp(*together),
         "parts": lambda: solve_lcp(*alone),

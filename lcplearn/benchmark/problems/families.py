@@ -4,7 +4,7 @@ Each function returns `Problems(M, q, z)`, float64: M [B, n, n], q [B, n] and a 
 known (for M that is not a P-matrix there may be others), else None.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,17 @@ class Problems(NamedTuple):
     M: np.ndarray
     q: np.ndarray
     z: np.ndarray | None
+
+
+def side_by_side(parts: Sequence[tuple[np.ndarray, np.ndarray]], idle: int = 0) -> Problems:
+    """Batches (M, q) as one, block by block, and behind them rows that do nothing: M is 1 and q is 1 there."""
+    B, n = len(parts[0][1]), sum(q.shape[1] for _, q in parts) + idle
+    whole, whole_q = np.tile(np.eye(n), (B, 1, 1)), np.ones((B, n))
+    start = 0
+    for M, q in parts:
+        rows = slice(start, start := start + q.shape[1])
+        whole[:, rows, rows], whole_q[:, rows] = M, q
+    return Problems(whole, whole_q, None)
 
 
 def _plant(rng: np.random.Generator, M: np.ndarray) -> Problems:
