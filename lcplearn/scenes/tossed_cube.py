@@ -13,7 +13,7 @@ from lcplearn.scenes.contact import RestitutionLaw
 from lcplearn.scenes.contact_violation import contact_violation
 from lcplearn.scenes.numbers import Number
 from lcplearn.scenes.scene import Drive, Moving, Step, Trajectory
-from lcplearn.scenes.space import POSE, Space
+from lcplearn.scenes.space import POSE, Space, rotation_matrix
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
 IMPACT_SPEED = 10.0  # [half widths/s] closing speed from which on an impact has the friction mu_impact
@@ -23,6 +23,12 @@ TENTH = 0.00524  # [m] a tenth of the published cube's half width: lengths that 
 @dataclass(frozen=True)
 class TossedCube(Moving):
     """`SpatialBody` with the corners of a cube, rounded, or with corners of its own.
+
+    A recorded velocity is a difference of two positions: the mean over dt. With n substeps of h = dt / n the velocity
+    of the last substep of a fall is v + g (dt - h) / 2, and a step from there moves by dt (v + g dt), as one step does.
+    So in flight the velocity of a state is that mean, whatever the substeps; where a corner touches, it is that of the
+    last substep, and a cube at rest has velocity 0. A corner touches below the height of g dt^2, which a body that was
+    at rest falls in a step. As this depends on the pose alone, a rollout goes on as it would without it (NOTES 5.7).
 
     Attributes:
         half_width: Half of the cube's width [m].
@@ -110,22 +116,32 @@ class TossedCube(Moving):
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one step; the mode is that of each corner, in the last of the substeps."""
-        steps = [self.body.advance(state, drive)]
+        steps = [self.body.advance(self._fallen(state, 1.0), drive)]
         while len(steps) < self.substeps:
             steps.append(self.body.advance(steps[-1].state, drive))
         solved = torch.stack([step.solved for step in steps if step.solved is not None]).all(0)
-        return steps[-1]._replace(solved=solved)
+        return steps[-1]._replace(state=self._fallen(steps[-1].state, -1.0), solved=solved)
 
     def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
         """As `SpatialBody.fused_rollout`."""
         n = self.substeps
-        path = self.body.fused_rollout(state, drive.map(lambda x: x.repeat_interleave(n, dim=-2)))
+        drive = drive.map(lambda x: x.repeat_interleave(n, dim=-2))
+        path = self.body.fused_rollout(self._fallen(state, 1.0), drive)
         if path is None or path.solved is None or n == 1:
             return path
-        positions, velocities = path.positions[..., ::n, :], path.velocities[..., ::n, :]
-        return Trajectory(
-            positions, velocities, path.mode[..., n - 1 :: n, :], path.solved.unflatten(-1, (-1, n)).all(-1)
-        )
+        rows = self._fallen(path.states[..., ::n, :].movedim(-2, 0), -1.0).movedim(0, -2)
+        return Trajectory(*POSE.split(rows), path.mode[..., n - 1 :: n, :], path.solved.unflatten(-1, (-1, n)).all(-1))
+
+    def _fallen(self, state: Float[Tensor, "*#batch 13"], steps: float) -> Float[Tensor, "*#batch 13"]:
+        """The state with that much of g (dt - h) / 2 added to its velocity, if no corner touches."""
+        if self.substeps == 1:
+            return state
+        body, (position, _) = self.body, POSE.split(state)
+        corners = body.corners @ rotation_matrix(position[..., 3:])[..., 2, :, None]
+        gap = position[..., 2] + corners[..., 0].amin(-1) - self.radius - self.ground
+        more = torch.zeros_like(state)
+        more[..., 9] = -steps * self.gravity * (self.dt - body.dt) / 2.0
+        return state + torch.where(gap.unsqueeze(-1) > self.gravity * self.dt**2, more, 0.0)
 
     def violation(
         self, before: Float[Tensor, "*batch 13"], drive: Drive, after: Float[Tensor, "*batch 13"]

@@ -1,5 +1,8 @@
 """A tossed cube: flight, exact rest, and the loss that asks which impulses explain a recorded step."""
 
+from unittest import mock
+
+import pytest
 import torch
 
 from lcplearn.scenes.scene import Drive, rollout
@@ -39,21 +42,76 @@ def test_rounded_corners_leave_the_faces_where_they_are_and_rest_is_exact():
         )
 
 
-def test_substeps_are_steps_of_a_shorter_time_under_the_same_force():
-    push = Drive(0.1 * torch.randn(6, 40, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
-    numbers = {**NUMBERS, "mu_impact": 0.15, "restitution": 0.3, "radius": 0.1 * H}
-    fine = rollout(
-        TossedCube(**{**numbers, "dt": DT / 3}), start(2.0), push.map(lambda x: x.repeat_interleave(3, dim=-2))
-    )
-    cube = TossedCube(**numbers, substeps=3)
-    path = rollout(cube, start(2.0), push)
-    assert torch.equal(path.states, fine.states[:, ::3])
-    assert torch.equal(path.mode, fine.mode[:, 2::3])
+ROUNDED = {**NUMBERS, "mu_impact": 0.15, "restitution": 0.3, "radius": 0.1 * H}
+PUSH = Drive(0.1 * torch.randn(6, 40, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+
+
+@pytest.mark.parametrize("n", [2, 4, 7])
+def test_with_substeps_a_flight_is_the_recorded_one(n: int):
+    """A recorded velocity is the mean over the step before: both a start and what is reported are."""
+    one, many = (rollout(TossedCube(**ROUNDED, substeps=k), start(40.0), forces(20)) for k in (1, n))
+    torch.testing.assert_close(many.states, one.states, rtol=0, atol=1e-13)
+    means = (many.positions[:, 1:, :3] - many.positions[:, :-1, :3]) / DT
+    torch.testing.assert_close(many.velocities[:, 1:, :3], means, rtol=0, atol=1e-11)
+
+
+def test_substeps_are_steps_of_a_shorter_time_from_the_velocity_of_the_last_of_them():
+    n, height = 3, 4.0
+    first, fine = start(height), {**ROUNDED, "dt": DT / n}
+    first[:, 9] -= 9.81 * (DT - DT / n) / 2
+    fine_path = rollout(TossedCube(**fine), first, PUSH.map(lambda x: x.repeat_interleave(n, dim=-2)))
+    path = rollout(TossedCube(**ROUNDED, substeps=n), start(height), PUSH)
+    torch.testing.assert_close(path.positions, fine_path.positions[:, ::n], rtol=0, atol=1e-12)
+    assert torch.equal(path.mode, fine_path.mode[:, n - 1 :: n])
     assert path.solved.shape == (6, 40)
     assert bool(path.solved.all())
-    step = cube.advance(path.states[:, 20], push.at(20))
-    torch.testing.assert_close(step.state, path.states[:, 21], rtol=0, atol=1e-9)
-    assert torch.equal(step.mode, path.mode[:, 20])
+    behind = path.velocities - fine_path.velocities[:, ::n]
+    falls = (fine_path.positions[:, ::n, 2] > 2.0 * H).nonzero()
+    torch.testing.assert_close(behind[*falls.T, 2], torch.full((len(falls),), 9.81 * DT / 3, dtype=torch.float64))
+    torch.testing.assert_close(behind[..., [0, 1, 3, 4, 5]], torch.zeros(6, 41, 5, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_with_substeps_steps_make_the_rollout_and_a_batch_is_its_elements(n: int):
+    mu = torch.linspace(0.1, 0.4, 6, dtype=torch.float64)
+    path = rollout(TossedCube(**{**ROUNDED, "mu": mu}, substeps=n), start(3.0), PUSH)
+    state, touched = start(3.0), 0
+    for k in range(40):
+        step = TossedCube(**{**ROUNDED, "mu": mu}, substeps=n).advance(state, PUSH.at(k))
+        torch.testing.assert_close(step.state, path.states[:, k + 1], rtol=0, atol=1e-9)
+        assert torch.equal(step.mode, path.mode[:, k])
+        state, touched = path.states[:, k + 1], touched + int((step.mode != 2).any(-1).sum())
+    assert touched > 40
+    for b in range(6):
+        alone = rollout(TossedCube(**{**ROUNDED, "mu": mu[b]}, substeps=n), start(3.0)[b], PUSH.force[b])
+        assert torch.equal(alone.states, path.states[b])
+
+
+def test_with_substeps_compiled_rollouts_are_those_step_by_step_in_torch():
+    cube = TossedCube(**ROUNDED, substeps=2)
+    compiled = rollout(cube, start(2.5)[:3], PUSH.map(lambda x: x[:3, :25]))
+    with mock.patch("lcplearn.scenes.spatial_body.compiled_contacts", return_value=None):
+        stepped = rollout(cube, start(2.5)[:3], PUSH.map(lambda x: x[:3, :25]))
+    torch.testing.assert_close(compiled.states, stepped.states, rtol=0, atol=1e-8)
+    assert torch.equal(compiled.mode, stepped.mode)
+
+
+def test_with_substeps_a_cube_at_rest_has_velocity_0_and_stays_bit_by_bit():
+    path = rollout(TossedCube(**ROUNDED, substeps=4), start(), forces(500))
+    assert torch.equal(path.velocities[:, -1], torch.zeros(6, 6, dtype=torch.float64))
+    on = rollout(TossedCube(**ROUNDED, substeps=4), path.states[:, -1], forces(20))
+    assert torch.equal(on.states, path.states[:, -1:].expand(-1, 21, -1))
+
+
+def test_with_substeps_the_gradient_is_that_of_differences():
+    def end(mu: torch.Tensor, ground: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
+        numbers = {**ROUNDED, "mu": mu, "ground": ground}
+        return rollout(TossedCube(**numbers, substeps=3), first, forces(12)).states[:, -1].square().sum()
+
+    given = (torch.tensor(0.2, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64), start(2.0))
+    assert torch.autograd.gradcheck(
+        end, [x.requires_grad_() for x in given], eps=1e-7, atol=1e-5, rtol=1e-4, nondet_tol=0.0
+    )
 
 
 def violation(states: torch.Tensor, **numbers: float | torch.Tensor) -> torch.Tensor:
