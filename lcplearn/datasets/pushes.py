@@ -81,11 +81,15 @@ def read_pushes(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not as described in data/README.md, or a setting does not fit it.
+        ValueError: The file is not as described in data/README.md, has no end poses or forces to learn from, or a
+            setting does not fit it.
     """
     path = find(FILE) if path is None else Path(path)
     data = read_all_pushes(path)
     count = len(data.configuration)
+    for name, told in data.outcome._asdict().items():
+        if bool(told.isnan().any()):
+            raise ValueError(f"{path}: {name}: expected how each push ended, to learn from, got none")
     if protocol not in PROTOCOLS:
         raise ValueError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {protocol}")
     if not 2 <= folds <= count:
@@ -111,7 +115,7 @@ def read_pushes(
 def read_all_pushes(path: Path | str) -> PushData:
     """All pushes of a file, without splits: to score a model that is trained.
 
-    A file without end poses and forces can be predicted, and not scored: its outcome is NaN.
+    A file without end poses or forces can be predicted, and not scored by them: they are NaN.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -122,8 +126,8 @@ def read_all_pushes(path: Path | str) -> PushData:
     config = _configurations(path, arrays)
     ends = np.array([straighten(rows[:, 1:]) for rows in _records(path, arrays, "pusher")])
     pose, force = np.full((len(config), 3), np.nan), np.full((len(config), 2), np.nan)
-    if all(name in arrays for name in _OUTCOME):
-        pose = arrays["post_pose"]
+    pose = arrays.get("post_pose", pose)
+    if "force" in arrays and "force_offsets" in arrays:
         rows = _records(path, arrays, "force")
         force = np.array([part[part[:, 0] >= part[-1, 0] / 2.0, 1:].mean(0) for part in rows])
     pre_pose, start, end, post_pose, mean_force, points, vertices, com = (
@@ -176,7 +180,20 @@ def _configurations(path: Path | str, arrays: dict[str, NDArray]) -> NDArray:
     config = arrays["config"].astype(np.int64)
     if count == 0 or config.min() < 0 or config.max() >= configurations:
         raise ValueError(f"{path}: config: expected numbers from 0 to {configurations - 1} for at least one push")
+    for points in arrays["config_support_points"]:
+        if not (np.isnan(points).all() or _bear(points, arrays["object_com"])):
+            raise ValueError(
+                f"{path}: config_support_points: expected three points around the centre of mass, or NaN for the "
+                f"whole face, got {points.tolist()}"
+            )
     return config
+
+
+def _bear(points: NDArray, com: NDArray) -> bool:
+    """Whether all three points bear a share of the weight."""
+    arms = points - com
+    shares = [a[0] * b[1] - a[1] * b[0] for a, b in ((arms[1], arms[2]), (arms[2], arms[0]), (arms[0], arms[1]))]
+    return bool((np.array(shares) > 0.0).all() or (np.array(shares) < 0.0).all())
 
 
 def _records(path: Path | str, arrays: dict[str, NDArray], name: str) -> list[NDArray]:

@@ -7,7 +7,7 @@ import torch
 
 from lcplearn.datasets.simulated import splits
 from lcplearn.datasets.task import Task
-from lcplearn.domains import NOT_NEGATIVE, check
+from lcplearn.domains import NOT_NEGATIVE, POSITIVE, SHARE, check
 from lcplearn.scenes.planar_block import PlanarBlock
 from lcplearn.scenes.planar_body import PlanarBody, rectangle, turned
 from lcplearn.scenes.scene import Drive, rollout
@@ -55,6 +55,7 @@ def simulate_planar_block(
         ValueError: An argument is out of range.
     """
     check(NOT_NEGATIVE, noise=noise)
+    check(SHARE, switch_probability=switch_probability)
     if friction not in (None, "physical"):
         raise ValueError(f"friction: expected 'physical' or None, got {friction!r}")
     block = PlanarBlock(mass=mass, mu=mu, dt=dt, gravity=gravity)
@@ -108,6 +109,7 @@ def simulate_planar_body(
         ValueError: An argument is out of range.
     """
     check(NOT_NEGATIVE, noise=noise)
+    check(POSITIVE, half_width=half_width, half_height=half_height)
     corners = rectangle(half_width, half_height)
     body = PlanarBody(
         corners=corners, inertia=inertia, mu=mu, dt=dt, mass=mass, restitution=restitution, gravity=gravity

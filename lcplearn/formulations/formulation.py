@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from lcplearn.datasets.recordings import Windows
 from lcplearn.datasets.task import Task
 from lcplearn.domains import positive
-from lcplearn.scenes.scene import Drive, Scene, Step, Trajectory, rollout
+from lcplearn.scenes.scene import Drive, Scene, Step, Trajectory, check_columns, rollout
 from lcplearn.scenes.space import Space
 
 
@@ -78,8 +78,14 @@ class Formulation(nn.Module):
         force: Float[Tensor, "*batch nv"],
         friction: Float[Tensor, "*batch 2"] | None = None,
     ) -> Float[Tensor, "*batch nq_plus_nv"]:
-        """Advance a state by one step under a force [N], in float64 as all parameters are."""
-        return self.advance(state.double(), Drive(force, friction).map(Tensor.double)).state
+        """Advance a state by one step under a force [N], in float64 as all parameters are.
+
+        Raises:
+            ValueError: State, force or friction has another number of columns.
+        """
+        drive = Drive(force, friction).map(Tensor.double)
+        check_columns(self.space, state, drive)
+        return self.advance(state.double(), drive).state
 
     def rollout(
         self,

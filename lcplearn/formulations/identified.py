@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lcplearn.datasets.recordings import Windows
-from lcplearn.domains import Domain
+from lcplearn.domains import POSITIVE, Domain, check
 from lcplearn.formulations.formulation import Formulation
 from lcplearn.formulations.line.formulation import path_error, step_error
 from lcplearn.scenes.scene import Drive, Scene, Step
@@ -38,8 +38,8 @@ class Identified(Formulation):
 
     Raises:
         ValueError: scene can't be imported or has no numbers, learn names none of them or starts outside its domain,
-            fixed names what the scene has not or what is learned, or a value that the scene needs is neither given
-            nor learned.
+            fixed names what the scene has not or what is learned, a value that the scene needs is neither given
+            nor learned, a list is no array of numbers, or clip is not positive.
     """
 
     def __init__(
@@ -62,6 +62,7 @@ class Identified(Formulation):
         odd = [name for name in fixed or {} if name not in fields.keys() - {"dt", *learn}]
         if odd:
             raise ValueError(f"fixed: expected arguments of {kind.__name__} that are not learned, got {odd[0]}")
+        check(POSITIVE, clip=clip)
         given = {**(given or {}), **(fixed or {})}
         known = {name: value for name, value in given.items() if name in fields.keys() - {"dt", *learn}}
         missing = [
@@ -76,8 +77,8 @@ class Identified(Formulation):
             )
         learned = {name: domains[name] for name in learn}
         starts = {name: _free(f"learn.{name}", value, domains[name]) for name, value in learn.items()}
-        known = {name: _tensor(value) if isinstance(value, list) else value for name, value in known.items()}
-        start = kind(dt=dt, **known, **{name: _tensor(value) for name, value in learn.items()})
+        known = {name: _tensor(name, value) if isinstance(value, list) else value for name, value in known.items()}
+        start = kind(dt=dt, **known, **{name: _tensor(name, value) for name, value in learn.items()})
         super().__init__(space=start.space, dt=dt, given=known)
         self.fixed = known
         self.contacts, self.radius = start.contacts, getattr(start, "length", 1.0)
@@ -205,7 +206,7 @@ def _class(scene: str | type) -> Any:
 
 def _free(name: str, value: Number, domain: Domain) -> nn.Parameter:
     """The parameter, free of bounds, of a number in its domain."""
-    start = _tensor(value)
+    start = _tensor(name, value)
     inside = all(number in domain and number not in (domain.low, domain.high) for number in start.reshape(-1).tolist())
     if not inside:
         raise ValueError(f"{name}: expected {domain.words}, inside its bounds, got {value}")
@@ -229,8 +230,11 @@ def clip_rows(gradients: Float[Tensor, "N P"], most: float) -> Float[Tensor, "N 
     return torch.where(fine.unsqueeze(-1), gradients * factor.unsqueeze(-1), 0.0)
 
 
-def _tensor(value: Any) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)
+def _tensor(name: str, value: Any) -> Tensor:
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected a number, or lists of numbers of one length, got {value!r}") from None
 
 
 def _bound(free: Tensor, domain: Domain) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lcplearn.domains import positive
+from lcplearn.domains import NOT_NEGATIVE, check, positive
 from lcplearn.formulations.formulation import Formulation
 from lcplearn.formulations.networks import log_parameter, network
 from lcplearn.lcp.solve import solve_lcp
@@ -144,9 +144,9 @@ class PlanarTraditional(TableFormulation):
         dt: Time step [s].
         space: Must be `TABLE`.
         gravity: Acceleration of gravity [m/s^2].
-        m: Number of directions.
+        m: Number of directions; >= 3.
         initial_mu: Friction coefficient at the start; > 0.
-        initial_noise: Standard deviation of the noise on the initial entries of F, f and G.
+        initial_noise: Standard deviation of the noise on the initial entries of F and G; >= 0.
     """
 
     def __init__(
@@ -160,6 +160,9 @@ class PlanarTraditional(TableFormulation):
         initial_noise: float = 0.03,
     ) -> None:
         super().__init__(dt=dt, space=space)
+        check(NOT_NEGATIVE, initial_noise=initial_noise)
+        if m < 3:
+            raise ValueError(f"m: expected at least 3 directions, got {m}")
         self.given = {"gravity": positive("gravity", gravity)}
         self.weight, self.bias = _frictionless()
         D = facet_normals(m, self.bias)

@@ -26,10 +26,10 @@ def slide_in_plane(p: Float[Tensor, "*#batch 2"], c: Float[Tensor, "*#batch"] | 
         c: Largest velocity change that friction can cause in one step, mu g dt [m/s]; >= 0.
 
     Returns:
-        Next velocity [m/s]; exactly 0 where |p| <= c. At |p| = c the gradient is 0, that of stick.
+        Next velocity [m/s]; exactly 0 where |p| <= c. At |p| = c the gradient is 0, that of stick. NaN stays NaN.
     """
     speed = torch.linalg.vector_norm(p, dim=-1)
-    slides = speed > c
+    slides = ~(speed <= c)  # true of NaN, too: what is not known does not rest
     factor = 1.0 - c / torch.where(slides, speed, 1.0)
     return torch.where(slides.unsqueeze(-1), factor.unsqueeze(-1) * p, 0.0)
 
@@ -95,6 +95,8 @@ class PlanarBlock(Moving):
         check_numbers(self)
         if self.form not in ("exact", "facets", "traditional"):
             raise ValueError(f"form: expected 'exact', 'facets' or 'traditional', got {self.form!r}")
+        if isinstance(self.mass, tuple) and len(self.mass) != 2:
+            raise ValueError(f"mass: expected one number or two, got {len(self.mass)}")
         if self.form != "exact" and (self.m < 3 or isinstance(self.mass, tuple)):
             raise ValueError(f"form: {self.form!r} needs one mass and m >= 3 facets, got {self.mass!r} and {self.m}")
 
@@ -144,8 +146,9 @@ class PlanarBlock(Moving):
         corners = torch.stack(((angles + math.pi / self.m).cos(), (angles + math.pi / self.m).sin()))
         M = torch.nn.functional.pad(corners.mT @ corners, (0, 1, 0, 1))
         M[: self.m, self.m], M[self.m, : self.m] = 1.0, -1.0
-        bound = (limit / math.cos(math.pi / self.m)).expand(*p.shape[:-1], 1)
-        solution = solve_lcp(M, torch.cat((-p @ corners, bound), dim=-1))
+        bound = limit / math.cos(math.pi / self.m)
+        rows = torch.broadcast_tensors(*(-p @ corners).split(1, dim=-1), bound)
+        solution = solve_lcp(M, torch.cat(rows, dim=-1))
         gamma = solution.z[..., -1:]
         velocity = p - matvec(corners, solution.z[..., :-1])
         return torch.where(gamma == 0.0, 0.0, velocity), solution.solved

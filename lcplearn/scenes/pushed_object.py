@@ -104,6 +104,10 @@ class PushedObject:
         corners = edges[:, 0] * edges.roll(-1, 0)[:, 1] - edges[:, 1] * edges.roll(-1, 0)[:, 0]
         if len(self.vertices) < 3 or not bool((corners > 0).all()):
             raise ValueError(f"vertices: expected a convex polygon, counterclockwise, got {self.vertices.tolist()}")
+        if self.law not in ("cone", "polygon", "ellipsoid"):
+            raise ValueError(f"law: expected 'cone', 'polygon' or 'ellipsoid', got {self.law!r}")
+        if self.facets < 3:
+            raise ValueError(f"facets: expected at least 3, got {self.facets}")
         for name in ("mass", "radius", "gravity", "steps", "creep", "iterations"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")

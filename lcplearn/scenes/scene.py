@@ -113,7 +113,12 @@ class Moving:
     """Step and rollout, for classes with `advance`."""
 
     def step(self: Scene, state: Float[Tensor, "*#batch nq_plus_nv"], force: Float[Tensor, "*#batch nv"]) -> Tensor:
-        """Next state under a force [N]."""
+        """Next state under a force [N].
+
+        Raises:
+            ValueError: State or force has another number of columns.
+        """
+        check_columns(self.space, state, Drive(force))
         return self.advance(state, Drive(force)).state
 
     def rollout(
@@ -141,13 +146,17 @@ def rollout(
         The trajectory, with the start as its first instant.
 
     Raises:
-        ValueError: The force has fewer than two dimensions or no step, or force or state another number of columns.
+        ValueError: The force has fewer than two dimensions or no step, friction is of other steps, or a state, force or
+            friction has another number of columns.
     """
     drive = drive if isinstance(drive, Drive) else Drive(drive)
     force, space = drive.force, scene.space
     if force.ndim < 2 or force.shape[-2] == 0 or force.shape[-1] != space.nv:
         raise ValueError(f"forces: expected shape [*batch, T, {space.nv}] with T >= 1, got {list(force.shape)}")
-    space.split(state)
+    check_columns(space, state, drive)
+    friction = drive.friction
+    if friction is not None and (friction.ndim < 2 or friction.shape[-2] != force.shape[-2]):
+        raise ValueError(f"friction: expected shape [*batch, {force.shape[-2]}, 2], got {list(friction.shape)}")
     fused = getattr(scene, "fused_rollout", None)
     if fused is not None and (path := fused(state, drive)) is not None:
         return path
@@ -167,3 +176,15 @@ def rollout(
     mode = torch.stack(torch.broadcast_tensors(*modes), dim=-2)
     right = torch.stack(torch.broadcast_tensors(*solved), dim=-1) if solved else None
     return Trajectory(positions, velocities, mode, right)
+
+
+def check_columns(space: Space, state: Tensor, drive: Drive) -> None:
+    """Refuse what a scene would read some columns of, or none.
+
+    Raises:
+        ValueError: State, force or friction has another number of columns; the message names it.
+    """
+    space.split(state)
+    for name, values, columns in (("force", drive.force, space.nv), ("friction", drive.friction, 2)):
+        if values is not None and values.shape[-1:] != (columns,):
+            raise ValueError(f"{name}: expected shape [*batch, {columns}], got {list(values.shape)}")

@@ -12,6 +12,7 @@ from torch.nn.functional import softplus
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, Domain, check, check_numbers
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
+from lcplearn.scenes.numbers import as_tensor
 from lcplearn.scenes.scene import Drive, Mode, Moving, Step
 from lcplearn.scenes.space import LINE, Space
 from lcplearn.scenes.violation import violation
@@ -214,7 +215,7 @@ class SlidingBlock(Moving):
     def _solve(self, velocity: Tensor, force: Tensor) -> tuple[Tensor, LCPSolution | None]:
         if self.temperature > 0.0:
             p = self._free_velocity(velocity, force)
-            excess = torch.stack((p, -p), dim=-1) - torch.as_tensor(self.mu * self.gravity * self.dt)[..., None]
+            excess = torch.stack((p, -p), dim=-1) - as_tensor(self.mu * self.gravity * self.dt, p)[..., None]
             parts = self.temperature * softplus(excess / self.temperature)
             return parts[..., 0] - parts[..., 1], None
         M, q = self.lcp(velocity, force)

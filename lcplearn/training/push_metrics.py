@@ -14,7 +14,7 @@ from lcplearn.training.figures_of_merit import figure
 
 
 class PushErrors(NamedTuple):
-    """Errors of each push, by the names of `figures_of_merit`; empty where a model predicts no force."""
+    """Errors of each push, by the names of `figures_of_merit`; of forces where they are predicted and recorded."""
 
     values: dict[str, Float[Tensor, " b"]]
 
@@ -43,7 +43,7 @@ def errors(model: PushModel, data: PushData, prediction: PushPrediction) -> Push
         "rotation_deg": torch.rad2deg(error[:, 2].abs() / RADIUS),
         "twist_angle_deg": _angle(found, true),
     }
-    if prediction.force is not None:
+    if prediction.force is not None and not bool(data.outcome.force.isnan().any()):
         values["force_direction_deg"] = _angle(prediction.force, data.outcome.force)
         values["force_size_n"] = (prediction.force.norm(dim=-1) - data.outcome.force.norm(dim=-1)).abs()
     return PushErrors({name: value.nan_to_num(torch.inf, torch.inf) for name, value in values.items()})

@@ -9,6 +9,8 @@ from real_data import real_data
 from lcplearn.datasets.pushes import read_all_pushes, read_pushes, straighten
 from lcplearn.scenes.pushes import geometries
 
+FEET = push_arrays()["config_support_points"]
+
 
 @pytest.fixture
 def file(tmp_path):
@@ -106,11 +108,20 @@ def test_the_same_seed_draws_the_same_parts(file):
         ({"pusher_offsets": np.array(1)}, "pusher"),
         ({"pre_pose": np.full((12, 3), "a")}, "pre_pose: expected numbers of shape"),
         ({"object_vertices": np.zeros(4)}, "object_vertices"),
+        ({"config_support_points": np.add(FEET, 0.06)}, "config_support_points: expected three points around"),
+        ({"config_support_points": FEET * [1.0, 0.0]}, "config_support_points: expected three points around"),
     ],
 )
 def test_a_file_that_is_not_as_described_is_refused_by_name(file, changes, named):
     with pytest.raises(ValueError, match=named):
         read_all_pushes(file(**changes))
+
+
+@pytest.mark.parametrize(("missing", "named"), [("post_pose", "pose"), ("force", "force"), ("force_offsets", "force")])
+def test_pushes_without_their_ends_are_not_learned_from(file, missing, named):
+    assert read_all_pushes(file(**{missing: None})).outcome._asdict()[named].isnan().all()
+    with pytest.raises(ValueError, match=f"{named}: expected how each push ended"):
+        read_pushes(file(**{missing: None}), folds=3)
 
 
 @pytest.mark.parametrize(

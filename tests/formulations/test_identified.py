@@ -139,6 +139,11 @@ def test_a_number_stays_between_any_two_ends() -> None:
             r"^fixed: expected arguments of SlidingBlock that are not learned, got mue",
         ),
         ({"learn": {"mu": 0.1}, "fixed": {"mu": 0.1}}, r"^fixed: expected .* not learned, got mu"),
+        ({"learn": {"mu": 0.1}, "given": {"mass": 1.0}, "clip": -1.0}, "^clip: expected a positive number, got -1.0"),
+        (
+            {"learn": {"mu": [0.1, [0.2]]}, "given": {"mass": 1.0}},
+            r"^learn\.mu: expected a number, or lists of numbers",
+        ),
         ({"learn": {"mu": 0.1}}, r"^given: expected mass of SlidingBlock, got none"),
         ({"learn": {"mu": 0.1}, "scene": "lcplearn.scenes.Nothing"}, "^scene: expected the dotted name of a class"),
         ({"learn": {"mu": 0.1}, "scene": Formulation}, "^scene: expected a dataclass"),

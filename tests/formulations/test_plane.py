@@ -85,3 +85,18 @@ def test_a_tossed_rectangle_is_reproduced_by_its_true_numbers_and_gives_them_gra
 def test_the_planar_model_refuses_another_space():
     with pytest.raises(ValueError, match="space: expected TABLE"):
         PlanarFriction(dt=0.05, space=PLANE)
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "value"),
+    [
+        (PlanarTraditional, "initial_noise", -0.1),
+        (PlanarTraditional, "m", 2),
+        (simulate_planar_block, "switch_probability", 2.0),
+        (simulate_planar_body, "half_width", 0.0),
+        (simulate_planar_body, "half_height", -0.1),
+    ],
+)
+def test_a_wrong_argument_is_named(call, name, value):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        call(**{"dt": 0.05, name: value})

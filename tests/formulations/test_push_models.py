@@ -118,10 +118,28 @@ def test_shipped_checkpoints_predict(data, name):
     assert ((moved > 0.002) & (moved < 0.03)).all()  # the finger goes 12 mm from the first touch on
 
 
-def test_an_unknown_surface_is_refused_by_name(data, known):
-    model, _ = known
+@pytest.mark.parametrize("kind", [Supports, Residual])
+def test_an_unknown_surface_is_refused_by_name(data, fitted, kind):
     with pytest.raises(ValueError, match="surface: expected board or wood, as learned, got ice"):
-        model.predict(data.pushes._replace(surface=("ice",) * 24))
+        fitted[kind].predict(data.pushes._replace(surface=("ice",) * 24))
+
+
+@pytest.mark.parametrize("kind", [Supports, Residual, Ridge, PushMLP])
+def test_no_push_gives_no_prediction(data, fitted, kind):
+    found = fitted[kind].predict(data.pushes.take(torch.zeros(0, dtype=torch.long)))
+    assert found.pose.shape == (0, 3)
+    assert found.solved.shape == (0,)
+
+
+def test_a_law_without_gradient_is_refused(data):
+    # a TypeError first where the tests check types
+    with pytest.raises((ValueError, TypeError), match="law"):
+        Supports(**thing(data), law="polygon")
+
+
+def test_a_network_is_not_learned_from_one_push(data):
+    with pytest.raises(ValueError, match="pushes: expected at least 2 to learn from, got 1"):
+        run(PushMLP(**thing(data)), data.pushes.take([0]), data.outcome.take([0]))
 
 
 def test_motion_and_pose_are_inverse(data, known):

@@ -170,6 +170,29 @@ def test_a_block_on_a_table_in_three_forms():
         assert steps[0].solved.all()
 
 
+@pytest.mark.parametrize("form", ["exact", "facets", "traditional"])
+def test_what_is_not_a_number_does_not_rest(form):
+    scene = PlanarBlock(mass=1.5, mu=0.4, dt=0.05, form=form)
+    state = torch.tensor([[0.0, 0.0, math.nan, 0.0], [0.0, 0.0, 0.1, 0.0]])
+    step = scene.advance(state, Drive(torch.zeros(2)))
+    assert step.state[0, 2].isnan()
+    assert step.mode.tolist() == [[Mode.SLIP], [Mode.STICK]]
+
+
+@pytest.mark.parametrize("form", ["exact", "facets", "traditional"])
+def test_each_block_of_a_batch_may_have_its_own_friction(form):
+    mu, state = torch.tensor([0.1, 0.4]), torch.tensor([0.0, 0.0, 2.0, -1.0])
+    both = PlanarBlock(mass=1.5, mu=mu, dt=0.05, form=form).step(state, torch.zeros(2))
+    one = [PlanarBlock(mass=1.5, mu=float(x), dt=0.05, form=form).step(state, torch.zeros(2)) for x in mu]
+    torch.testing.assert_close(both, torch.stack(one), rtol=0, atol=1e-14)
+
+
+def test_a_block_has_one_mass_or_two():
+    # a TypeError first where the tests check types
+    with pytest.raises((ValueError, TypeError), match="mass"):
+        PlanarBlock(mass=(1.0, 2.0, 3.0), mu=0.4, dt=0.05)
+
+
 def test_the_cone_of_a_contact_is_the_closed_form_and_the_fixed_point_for_two_masses():
     p, mu, dt = free_speeds(300), 0.4, 0.05
     state = torch.cat((torch.zeros_like(p), p), dim=-1)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from lcplearn.formulations import Structured
 from lcplearn.scenes import BouncingBlock, Drive, FallingBlock, OneWayBlock, SlidingBlock, rollout
 from lcplearn.scenes.planar_block import PlanarBlock
 from lcplearn.scenes.planar_body import PlanarBody, PlanarStack
@@ -71,3 +72,15 @@ def test_a_wrong_shape_is_named():
         scene.rollout(torch.zeros(2), torch.zeros(0, 1))
     with pytest.raises(ValueError, match=r"^state: expected shape .* got \[1\]"):
         rollout(scene, torch.zeros(1), Drive(torch.zeros(5, 1)))
+    with pytest.raises(ValueError, match=r"^friction: expected shape \[\*batch, 5, 2\], got \[6, 2\]"):
+        rollout(scene, torch.zeros(2), Drive(torch.zeros(5, 1), torch.zeros(6, 2)))
+
+
+@pytest.mark.parametrize("mover", [SCENES[0], *BODIES, Structured(dt=0.05)], ids=lambda mover: type(mover).__name__)
+def test_a_step_refuses_columns_that_it_would_leave_aside(mover):
+    state, force = mover.space.origin(), torch.zeros(mover.space.nv, dtype=torch.float64)
+    one = torch.zeros(1, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"^state: expected shape"):
+        mover.step(torch.cat((state, one)), force)
+    with pytest.raises(ValueError, match=r"^force: expected shape"):
+        mover.step(state, torch.cat((force, one)))

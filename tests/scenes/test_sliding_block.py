@@ -250,3 +250,9 @@ def test_a_wrong_argument_is_named(name, arguments):
     # a wrong literal is a TypeError first where the tests check types
     with pytest.raises((ValueError, TypeError), match=name):
         block(**arguments)
+
+
+def test_a_softened_threshold_has_all_digits_of_its_numbers():
+    velocity, force = torch.tensor([2.0, -2.0], dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    soft, hard = (block(temperature=t).next_velocity(velocity, force) for t in (1e-6, 0.0))
+    torch.testing.assert_close(soft, hard, rtol=0, atol=1e-14)

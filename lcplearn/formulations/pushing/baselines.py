@@ -118,6 +118,8 @@ class PushMLP(Baseline):
         return torch.cat((seen.body, seen.direction, same(seen.edge, edges), same(seen.geometry, self.geometries)), -1)
 
     def fit(self, pushes: Pushes, outcome: Outcome) -> Iterator[dict[str, float]]:
+        if len(pushes.surface) < 2:  # their spread scales the outputs
+            raise ValueError(f"pushes: expected at least 2 to learn from, got {len(pushes.surface)}")
         self.geometries = features(pushes, self.object).geometry.unique(dim=0)
         self.arguments["known"] = len(self.geometries)
         self.network = self._network()

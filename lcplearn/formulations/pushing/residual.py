@@ -92,8 +92,8 @@ class Residual(PushModel):
         return PushPrediction(self.pose(pushes, motion), plain.force, plain.solved)
 
     def _features(self, pushes: Pushes) -> Features:
-        surface = torch.tensor([self.base.surfaces.index(name) for name in pushes.surface])
-        return Features(*(part.float().double() for part in features(pushes, self.base.object, surface)))
+        found = features(pushes, self.base.object, self.base.surface(pushes))
+        return Features(*(part.float().double() for part in found))
 
 
 def _latent(x: Float[Tensor, "b m"]) -> Latent:

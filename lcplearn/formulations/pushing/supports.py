@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lcplearn.formulations.pushing.gauss_newton import least_deviation
@@ -72,6 +72,8 @@ class Supports(PushModel):
         surfaces: Sequence[str] = (),
     ) -> None:
         super().__init__(vertices=vertices, com=com, mass=mass)
+        if law not in ("cone", "ellipsoid"):
+            raise ValueError(f"law: expected 'cone' or 'ellipsoid', which have a gradient, got {law!r}")
         if law == "ellipsoid" and (height or rim):
             raise ValueError("law: an ellipsoid has no loads: expected height=False and rim=False")
         self.arguments |= {"height": height, "rim": rim, "steps": steps, "law": law, "surfaces": list(surfaces)}
@@ -103,9 +105,6 @@ class Supports(PushModel):
         return found
 
     def predict(self, pushes: Pushes, latent: Latent | None = None) -> PushPrediction:
-        unknown = sorted(set(pushes.surface) - set(self.surfaces))
-        if unknown:
-            raise ValueError(f"surface: expected {' or '.join(self.surfaces)}, as learned, got {', '.join(unknown)}")
         return self.roll(pushes, self.numbers.expand(len(pushes.surface), -1), latent)
 
     def fit(self, pushes: Pushes, outcome: Outcome) -> Iterator[dict[str, float]]:
@@ -145,7 +144,7 @@ class Supports(PushModel):
         """
         force = self.predict(pushes).force
         assert force is not None
-        on = self._surface(pushes)
+        on = self.surface(pushes)
         for k in on.unique():
             kinds = {face: (on == k) & (pushes.whole_face == bool(face)) for face in (0, 1)}
             for face, mine in kinds.items():
@@ -156,15 +155,23 @@ class Supports(PushModel):
                 if not bool(mine.any()):
                     self.mu[k, face] = self.mu[k, 1 - face]
 
-    def _surface(self, pushes: Pushes) -> Tensor:
-        return torch.tensor([self.surfaces.index(name) for name in pushes.surface])
+    def surface(self, pushes: Pushes) -> Int[Tensor, " b"]:
+        """Number of each push's surface.
+
+        Raises:
+            ValueError: One is not learned.
+        """
+        unknown = sorted(set(pushes.surface) - set(self.surfaces))
+        if unknown:
+            raise ValueError(f"surface: expected {' or '.join(self.surfaces)}, as learned, got {', '.join(unknown)}")
+        return torch.tensor([self.surfaces.index(name) for name in pushes.surface], dtype=torch.long)
 
     def roll(self, pushes: Pushes, numbers: Float[Tensor, "b 3"], latent: Latent | None = None) -> PushPrediction:
         """Predict with numbers of its own for each push."""
         parts, order = [], []
         for whole_face in (False, True):
             index = (pushes.whole_face == whole_face).nonzero()[:, 0]
-            if len(index) == 0:
+            if len(index) == 0 and pushes.surface:
                 continue
             part = pushes.take(index)
             grip = self.grip(part, numbers[index], None if latent is None else latent.take(index))
@@ -192,7 +199,7 @@ class Supports(PushModel):
         if bool(pushes.whole_face.any()):
             points, weights = self._face(rim.sigmoid())
         loads, levers = plane_fit(points, self.com, weights)
-        mu = self.mu[self._surface(pushes), pushes.whole_face.long()]
+        mu = self.mu[self.surface(pushes), pushes.whole_face.long()]
         if latent is None:
             return Grip(points, loads, levers, mu, log_mu_c.exp(), height * HEIGHT)
         radius = self.object.radius
