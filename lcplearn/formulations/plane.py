@@ -106,7 +106,8 @@ class PlanarFriction(TableFormulation):
             return {}
         mobility = float(self.weight.detach()[:, 2:].diagonal().mean())
         mu = float(self.log_limit.detach().exp()) / (self.gravity * self.dt)
-        return {"mu": mu} | ({"mass": 1.0 / mobility} if mobility > 0.0 else {})
+        told = mobility > 0.0 and mobility != 1.0  # without any force it stays where it started, and tells nothing
+        return {"mu": mu} | ({"mass": 1.0 / mobility} if told else {})
 
 
 class PlanarDirect(TableFormulation):

@@ -1,5 +1,6 @@
 """What models are judged by: the name, meaning and heading of each figure of metrics.json, without torch."""
 
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -52,14 +53,22 @@ FIGURES = (
 )
 KEYS = tuple(figure.name for figure in FIGURES)
 _BY_NAME = {figure.name: figure for figure in FIGURES}
+# Of learned numbers; of several under one name, NAME_1, too.
+UNITS = {
+    **dict.fromkeys(("corners", "ground", "half_width", "radius"), "m"),
+    **{"mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2", "stiffness": "N/m"},
+}
 
 
 def figure(name: str) -> Figure:
     """A figure by its name; of learned numbers any name will do, and NAME_error."""
     if name in _BY_NAME:
         return _BY_NAME[name]
-    meaning = "|learned - true|" if name.endswith("_error") else "learned"
-    return Figure(name, meaning, name.replace("_", " "))
+    number = name.removesuffix("_error")
+    unit = UNITS.get(re.sub(r"_\d+$", "", number))
+    meaning = "learned" if name == number else "|learned - true|"
+    heading = name.replace("_", " ")
+    return Figure(name, f"{unit}, {meaning}" if unit else meaning, f"{heading} [{unit}]" if unit else heading)
 
 
 def in_order(names: Iterable[str]) -> list[str]:

@@ -67,6 +67,8 @@ class FormulationModule(pl.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         optimizers, stage = self._optimizers(), self.stage
+        if self.current_epoch + 1 == self.trainer.max_epochs:  # what no validation sees can't become the best
+            self.trainer.check_val_every_n_epoch = 1
         if self.current_epoch == stage.first:
             for optimizer in optimizers:
                 optimizer.state.clear()  # the gradients of another loss have another size

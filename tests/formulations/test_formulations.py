@@ -190,12 +190,22 @@ def test_temperature_gives_friction_a_gradient_on_the_plateau() -> None:
     assert model.temperature == 0.0
 
 
+MASSIVE = ("physical", "structured")
+
+
+def moved(model: Structured) -> Structured:
+    with torch.no_grad():
+        model.b_weight[1] /= 2.0
+    return model
+
+
 def test_physical_parameters_read_out_what_went_in() -> None:
-    for name in ("structured", "physical"):
-        values = FORMULATIONS[name](dt=DT, initial_mu=0.3, initial_mass=2.5).physical_parameters()
-        assert values == pytest.approx({"mu": 0.3, "mass": 2.5}, rel=1e-12)
-    assert set(Structured(dt=DT, c_network=True).physical_parameters()) == {"mass"}
-    assert set(Structured(dt=DT, b_network=True).physical_parameters()) == {"mu"}
+    physical, structured = (FORMULATIONS[name](dt=DT, initial_mu=0.3, initial_mass=2.5) for name in MASSIVE)
+    assert physical.physical_parameters() == pytest.approx({"mu": 0.3, "mass": 2.5}, rel=1e-12)
+    assert structured.physical_parameters() == pytest.approx({"mu": 0.3}, rel=1e-12)  # no force has told the mass
+    assert moved(structured).physical_parameters() == pytest.approx({"mu": 0.3, "mass": 5.0}, rel=1e-12)
+    assert set(moved(Structured(dt=DT, c_network=True)).physical_parameters()) == {"mass"}
+    assert set(moved(Structured(dt=DT, b_network=True)).physical_parameters()) == {"mu"}
     assert set(Structured(dt=DT, learn_b=False).physical_parameters()) == {"mu"}
     assert set(Physical(dt=DT, learn_mass=False).physical_parameters()) == {"mu"}
     assert ReLU(dt=DT).physical_parameters() == {}

@@ -391,6 +391,22 @@ def test_last_ckpt_is_written_every_time_and_never_knows_an_older_score_than_bes
     assert seen == [(0, 0.0), (1, 0.0), (2, 0.0)]
 
 
+def test_the_last_epoch_is_validated_and_may_be_the_best(tmp_path: Path) -> None:
+    data = tiny_data()
+    trainer = QUIET | {"check_val_every_n_epoch": 3}
+    result = short_fit(Structured(dt=data.dt), data, tmp_path / "run", epochs=5, trainer=trainer)
+    assert torch.load(tmp_path / "run" / "best.ckpt")["epoch"] == 4
+    assert torch.equal(parameters(result.model), parameters(load(tmp_path / "run" / "last.ckpt")))
+
+
+def test_without_any_force_no_mass_is_told(tmp_path: Path) -> None:
+    data = tiny_data(force_std=0.0)
+    result = short_fit(Structured(dt=data.dt), data, tmp_path / "run")
+    assert set(result.model.physical_parameters()) == {"mu"}
+    assert result.metrics is not None
+    assert "mass" not in result.metrics
+
+
 def test_a_run_moved_before_it_is_resumed_keeps_its_best_model(tmp_path: Path) -> None:
     data = tiny_data()
     short_fit(Structured(dt=data.dt), data, tmp_path / "first", epochs=3)

@@ -11,6 +11,7 @@ from lcplearn.formulations import LineFormulation, Physical
 from lcplearn.lcp.solution import LCPSolution
 from lcplearn.lcp.solve import solve_lcp
 from lcplearn.scenes import LINE, Drive
+from lcplearn.training.figures_of_merit import figure
 from lcplearn.training.metrics import evaluate, one_step
 
 DT = 0.1
@@ -108,3 +109,10 @@ def test_parameter_errors_are_distances_from_the_truth() -> None:
     found = evaluate(Physical(dt=DT, initial_mu=0.25, initial_mass=3.0), known)
     assert found["mu_error"] == pytest.approx(0.25)
     assert found["mass_error"] == pytest.approx(2.0)
+
+
+def test_learned_numbers_are_told_with_their_unit() -> None:
+    assert figure("stiffness_error").meaning == "N/m, |learned - true|"
+    assert figure("corners_12").meaning == "m, learned"
+    assert figure("restitution_error").meaning == "|learned - true|"  # it has none
+    assert figure("stiffness_error").heading == "stiffness error [N/m]"

@@ -73,7 +73,8 @@ class Structured(FrictionLCP):
 
     b = b_v v + b_u u + b_0 (+ net(v, u dt)),   a = exp(log a),   c = exp(log c) (or exp(log c + net(v)))
 
-    Only the product a c has an effect on the motion. Read-outs: mass = dt / b_u and mu = a c / (g dt).
+    Only the product a c has an effect on the motion. Read-outs: mass = 1 / b_u and mu = a c / (g dt); no mass where b_u
+    has not moved from its start, as without any force.
 
     Args:
         dt: Time step [s].
@@ -104,9 +105,10 @@ class Structured(FrictionLCP):
     ) -> None:
         super().__init__(dt=dt, gravity=gravity)
         mass, mu = positive("initial_mass", initial_mass), positive("initial_mu", initial_mu)
-        self.log_a = log_parameter("initial_mass", 1.0 / mass)
+        self.start = 1.0 / mass  # of b_u
+        self.log_a = log_parameter("initial_mass", self.start)
         self.log_c = log_parameter("initial_mu", mu * mass * gravity * dt)
-        self.b_weight = nn.Parameter(torch.tensor([1.0, 1.0 / mass], dtype=torch.float64))
+        self.b_weight = nn.Parameter(torch.tensor([1.0, self.start], dtype=torch.float64))
         self.b_bias = nn.Parameter(torch.zeros((), dtype=torch.float64))
         self.b_weight.requires_grad_(learn_b)
         self.b_bias.requires_grad_(learn_b)
@@ -129,6 +131,7 @@ class Structured(FrictionLCP):
         values = {}
         if self.c_net is None:
             values["mu"] = (self.log_a + self.log_c).exp().item() / (self.gravity * self.dt)
-        if self.b_net is None and self.b_weight.requires_grad:
-            values["mass"] = self.b_weight[1].reciprocal().item()
+        b_u = self.b_weight[1].item()
+        if self.b_net is None and b_u != self.start:  # without any force it stays there, and tells nothing
+            values["mass"] = 1.0 / b_u
         return values
