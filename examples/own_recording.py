@@ -36,7 +36,10 @@ def record(folder: Path, dt: float = 0.05) -> None:
 
 def read(folder: Path) -> Task:
     """A task of all files: half to learn from, a quarter to validate on, a quarter to judge by."""
-    tables = [torch.from_numpy(np.loadtxt(path, delimiter=",", skiprows=1)) for path in sorted(folder.glob("*.csv"))]
+    paths = sorted(folder.glob("*.csv"))
+    if len(paths) < 4:
+        raise ValueError(f"{folder}: expected at least 4 CSV files, one a recording, got {len(paths)}")
+    tables = [torch.from_numpy(np.loadtxt(path, delimiter=",", skiprows=1)) for path in paths]
     dt = float(tables[0][1, 0] - tables[0][0, 0])
     longest = max(len(table) for table in tables)
 
@@ -73,4 +76,7 @@ def main(folder: Path | None = None, epochs: int = 100) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    try:
+        main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    except ValueError as wrong:
+        sys.exit(str(wrong))

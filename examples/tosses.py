@@ -5,6 +5,7 @@ Needs the recordings: python -m lcplearn.datasets.get tosses
     python examples/tosses.py
 """
 
+import sys
 from pathlib import Path
 
 import torch
@@ -39,4 +40,7 @@ def main(count: int = 10) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except FileNotFoundError as missing:
+        sys.exit(str(missing))

@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+import runpy
+import sys
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -54,6 +56,22 @@ def test_own_recording():
     learned = example("own_recording").main(epochs=60)
     assert learned["mu"] == pytest.approx(0.4, abs=2e-3)
     assert learned["mass"] == pytest.approx(1.5, abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "said"),
+    [
+        ("own_recording", ["."], "expected at least 4 CSV files, one a recording, got 0"),
+        ("tosses", [], "no such file"),
+        ("pushes", [], "no such file"),
+    ],
+)
+def test_what_is_missing_is_said_in_a_sentence(name, arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LCPLEARN_DATA", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit, match=said):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
 
 
 def test_stick_slip_controller():
