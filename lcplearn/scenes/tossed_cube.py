@@ -116,11 +116,15 @@ class TossedCube(Moving):
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one step; the mode is that of each corner, in the last of the substeps."""
-        steps = [self.body.advance(self._fallen(state, 1.0), drive)]
+        steps = [self.substep(self._fallen(state, 1.0), drive)]
         while len(steps) < self.substeps:
-            steps.append(self.body.advance(steps[-1].state, drive))
+            steps.append(self.substep(steps[-1].state, drive))
         solved = torch.stack([step.solved for step in steps if step.solved is not None]).all(0)
         return steps[-1]._replace(state=self._fallen(steps[-1].state, -1.0), solved=solved)
+
+    def substep(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
+        """Advance a state by one of the substeps."""
+        return self.body.advance(state, drive)
 
     def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
         """As `SpatialBody.fused_rollout`."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.formulations.cube_corners import FACES, CubeCorners
+from lcplearn.formulations.cube_network import CubeNetwork
 from lcplearn.scenes.scene import Mode
 from lcplearn.scenes.space import rotation_matrix
 from lcplearn.scenes.spatial_body import box_corners
@@ -57,7 +58,7 @@ def median_toss(found: Predictions) -> Toss:
 
 
 def draw(found: Predictions) -> dict[str, "Figure"]:
-    """The toss of median error as a filmstrip and by its contacts; learned corners, where they are."""
+    """The toss of median error as a filmstrip and by its contacts; learned corners or laws, where they are."""
     toss, model = median_toss(found), found.model
     pictures = {"filmstrip": filmstrip(toss)}
     if model.contacts == 8:
@@ -65,6 +66,8 @@ def draw(found: Predictions) -> dict[str, "Figure"]:
     if isinstance(model, CubeCorners) and toss.corners is not None:
         start = CubeCorners(**dict(model.arguments)).numbers()["corners"].detach()
         pictures["corners"] = corner_views(toss.corners, start, toss.half_width)
+    if isinstance(model, CubeNetwork) and model.corrects != "force":
+        pictures["law"] = law_view(model)
     return pictures
 
 
@@ -128,6 +131,16 @@ def corner_views(learned: Float[Tensor, "8 3"], start: Float[Tensor, "8 3"], hal
         ax.set(aspect="equal", title=view, xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes[0][0].legend(fontsize=8, loc="center")
+    return figure
+
+
+def law_view(model: CubeNetwork) -> "Figure":
+    """Learned friction or restitution against the closing speed."""
+    figure, axes = _figure(1, 1, (5.0, 3.2))
+    ax, speed = axes[0][0], torch.linspace(0.0, 2.0, 201, dtype=torch.float64)
+    ax.plot(speed, model.law(speed), color=PREDICTED)
+    ax.set(xlabel="closing speed [m/s]", ylabel=model.corrects, xlim=(0.0, float(speed[-1])), ylim=(0.0, None))
+    ax.grid(alpha=0.3)
     return figure
 
 

@@ -91,7 +91,8 @@ def test_every_formulation_has_a_configuration() -> None:
     others = [name for name in names("model") if not name.startswith("push_")]
     targets = {settings(f"model={name}")["model"]["_target_"].rpartition(".")[2] for name in others}
     planar = {"PlanarFriction", "PlanarDirect", "PlanarTraditional"}
-    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified", "CubeCorners"} | planar
+    cubes = {"CubeCorners", "CubeNetwork"}
+    assert targets == {cls.__name__ for cls in FORMULATIONS.values()} | {"Identified"} | planar | cubes
 
 
 def test_every_experiment_says_its_claim_command_expectation_and_time() -> None:

@@ -13,10 +13,12 @@ from lightning.pytorch import Callback, Trainer
 from torch import Tensor
 from training.helpers import QUIET
 
+import lcplearn
 from lcplearn.datasets import Recordings, Task
 from lcplearn.datasets.cube_tosses import read_tosses
 from lcplearn.formulations import Identified, build
 from lcplearn.formulations.cube_corners import FACES, CubeCorners, flatten
+from lcplearn.formulations.cube_network import CubeNetwork
 from lcplearn.scenes.scene import Drive, rollout
 from lcplearn.scenes.space import POSE
 from lcplearn.scenes.spatial_body import box_corners
@@ -83,6 +85,38 @@ def test_a_training_in_stages_resumes_as_if_nothing_had_been_and_leaves_its_pict
     left = {path.name for path in (tmp_path / "second").iterdir()}
     assert {"filmstrip.png", "contact_modes.png", "corners.png", "toss.gif"} <= left
     assert (tmp_path / "second" / "toss.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_a_network_is_learned_beside_the_numbers_kept_and_drawn(tmp_path: Path):
+    data = simulated()
+    model = build(CubeNetwork, data, learn={**TRUE, "restitution": 0.3}, corrects="restitution", clip=10.0)
+    assert isinstance(model, CubeNetwork)
+    closing = torch.linspace(0.0, 2.0, 5, dtype=torch.float64)
+    torch.testing.assert_close(model.law(closing), torch.full((5,), 0.3, dtype=torch.float64))
+    with mock.patch("lcplearn.training.toss_figures.animation", return_value=b""):
+        fit(
+            model, data, folder=tmp_path, loss={"pose": 1.0}, horizon=8, epochs=2, batch_size=16, batches=2,
+            optimizer=Optimizer(lr=0.02), patience=None, trainer=QUIET,
+        )  # fmt: skip
+    law = model.law(closing)
+    assert float((law - law[0]).abs().max()) > 1e-5
+    loaded = lcplearn.load(tmp_path / "best.ckpt")
+    assert isinstance(loaded, CubeNetwork)
+    assert torch.equal(loaded.law(closing), law)
+    assert loaded.physical_parameters().keys() == {"mu", "inertia", "restitution"}
+    assert (tmp_path / "law.png").is_file()
+
+
+def test_a_law_of_friction_goes_from_sliding_to_impacts():
+    learn = {**TRUE, "mu_impact": 0.1}
+    model = CubeNetwork(dt=DT, given=KNOWN, learn=learn)
+    closing = torch.tensor([0.0, 5.0 * H, 10.0 * H, 20.0 * H], dtype=torch.float64)
+    torch.testing.assert_close(model.law(closing), torch.tensor([0.2, 0.15, 0.1, 0.1], dtype=torch.float64))
+    one = CubeNetwork(dt=DT, given=KNOWN, learn=TRUE)
+    torch.testing.assert_close(one.law(closing), torch.full((4,), 0.2, dtype=torch.float64))
+    for wrong, message in (({"units": 0}, "^units: expected"), ({"corrects": "mass"}, "^corrects: expected one of")):
+        with pytest.raises(ValueError, match=message):
+            CubeNetwork(**{"dt": DT, "given": KNOWN, "learn": TRUE, **wrong})
 
 
 @pytest.mark.parametrize("flat", [True, False])

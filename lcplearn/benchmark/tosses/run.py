@@ -55,6 +55,9 @@ ABLATIONS = {  # what is overridden in experiment=cube_body
     "four substeps": ("+model.fixed.substeps=4",),
     "two substeps, Newton's restitution": ("+model.fixed.substeps=2", "+model.fixed.restitution_law=newton"),
     "compliance learned": ("+model.learn.compliance=0.01",),
+    "friction by a network": ("model=cube_network", "~model.learn.mu_impact"),
+    "restitution by a network": ("model=cube_network", "model.corrects=restitution"),
+    "force by a network": ("model=cube_network", "model.corrects=force"),
 }
 PREDICTS = Callable[[Tensor, int], tuple[Tensor, Tensor | None]]  # start, steps -> states, whether each step is right
 
