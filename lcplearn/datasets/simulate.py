@@ -154,7 +154,8 @@ def simulate_falling_block(
     """Record a block dropped onto the ground, where it stays.
 
     The start is drawn from N(0, initial_speed^2) for the velocity and uniformly up to initial_height for the gap; no
-    force acts but gravity and contact. Only the velocity has measurement noise.
+    force acts but gravity and contact, so that gravity is to be found and the mass is given. Only the velocity has
+    measurement noise.
 
     Args:
         seed: Seed; the splits draw independently.
@@ -184,8 +185,8 @@ def simulate_falling_block(
         drive = Drive(torch.zeros(split.count, split.steps, 1, dtype=torch.float64))
         path = block.rollout(start, drive.force)
         recordings[split.name] = split.recordings(path.states, drive, noise, 1)
-    given = {"gravity": gravity}
-    return Task("falling_block", LINE, dt, **recordings, given=given, truth={"mass": mass}, scene=block, positions=True)
+    given, truth = {"mass": mass}, {"gravity": gravity}
+    return Task("falling_block", LINE, dt, **recordings, given=given, truth=truth, scene=block, positions=True)
 
 
 def _slide(block: SlidingBlock, start: Float[Tensor, " N"], forces: Float[Tensor, "N T"]) -> Float[Tensor, "N T+1"]:

@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 
 from lcplearn.datasets import Task, WindowLoader, Windows, windows
-from lcplearn.formulations import Formulation, loss_terms
+from lcplearn.formulations import Formulation, Physical, loss_terms
 from lcplearn.scenes.space import Space
 from lcplearn.training.asked import described_data, described_model, hyperparameters, setting, taken, write_config
 from lcplearn.training.callbacks import BestCheckpoint, Divergence, EarlyStop, LastCheckpoint, Report
@@ -179,6 +179,8 @@ def _check_agreement(model: Formulation, data: Task) -> None:
                 ", ".join(each.positions) if isinstance(each, Space) else each for each in (theirs[name], ours[name])
             )
             raise ValueError(f"model: expected {name} = {wanted} as in the data, got {got}")
+    if isinstance(model, Physical) and "mass" in model.domains and not bool(data.train.drive.force.any()):
+        raise ValueError("model: expected learn_mass=False (model=physical_mu), as no force acts that tells a mass")
 
 
 def _try_once(model: Formulation, window: Windows, loss: Mapping[str, float]) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 from lcplearn.datasets.pushes import PushData
 from lcplearn.formulations.pushing import PushModel, PushPrediction, Supports
 from lcplearn.scenes.pushed_object import rotate
+from lcplearn.training.figures import new_figure
 from lcplearn.training.push_metrics import by_configuration, errors, intervals
 
 if TYPE_CHECKING:
@@ -35,8 +36,9 @@ def draw_pushes(model: PushModel, data: PushData, prediction: PushPrediction, co
     for k in data.configuration.unique()[:count]:
         own = (data.configuration == k).nonzero()[:, 0]
         rows.append(int(own[deviation[own].argsort()[len(own) // 2]]))
-    figure = _figure((4.2 * 3, 4.4 * ((len(rows) + 2) // 3) + 0.6))
-    axes = figure.subplots((len(rows) + 2) // 3, 3, squeeze=False).ravel()
+    lines = (len(rows) + 2) // 3
+    figure, grid = new_figure(lines, 3, (4.2 * 3, 4.4 * lines + 0.6))
+    axes = [ax for line in grid for ax in line]
     for ax, row in zip(axes, rows, strict=False):
         _draw_push(ax, data, prediction, row)
         name = data.names[int(data.configuration[row])]
@@ -52,8 +54,7 @@ def draw_configurations(model: PushModel, data: PushData, prediction: PushPredic
     """Mean deviation of each configuration."""
     found = errors(model, data, prediction)
     table = by_configuration(found, data)
-    figure = _figure((8.0, 0.42 * len(table) + 1.6))
-    ax = figure.subplots()
+    figure, ((ax,),) = new_figure(1, 1, (8.0, 0.42 * len(table) + 1.6))
     values = [row["deviation_mm"] for row in table.values()]
     lengths = [value if math.isfinite(value) else 0.0 for value in values]
     ax.barh(range(len(table)), lengths, color="C0", height=0.6)
@@ -79,8 +80,7 @@ def animate_push(model: Supports, data: PushData, row: int, path: str | Path) ->
     one = data.take(torch.tensor([row]))
     with torch.no_grad():
         pushed = model.path(one.pushes)
-    figure = _figure((5.0, 5.2))
-    ax = figure.subplots()
+    figure, ((ax,),) = new_figure(1, 1, (5.0, 5.2))
     everything = _corners(data, torch.cat((pushed.poses[0], one.outcome.pose))).reshape(-1, 2) * CM
     low, high = everything.amin(0) - 2.0, everything.amax(0) + 2.0
 
@@ -138,12 +138,3 @@ def _supports(ax: "Axes", one: PushData, pose: Tensor) -> None:
 
 def _corners(data: PushData, poses: Tensor) -> Tensor:
     return rotate(poses[:, 2, None], data.vertices.expand(len(poses), -1, 2)) + poses[:, None, :2]
-
-
-def _figure(size: tuple[float, float]) -> "Figure":
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure

@@ -164,7 +164,7 @@ def test_falling_recordings_are_rollouts_of_the_scene_that_never_penetrate():
     assert torch.equal(part.true_states[..., 1], path.velocities[..., 0])
     assert torch.equal(part.states[..., 0], path.positions[..., 0])
     assert part.states[..., 0].min() == 0
-    assert (data.name, data.truth) == ("falling_block", {"mass": 1.0})
+    assert (data.name, data.given, data.truth) == ("falling_block", {"mass": 1.0}, {"gravity": 9.81})
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,13 @@ from torch import Tensor
 from training.helpers import QUIET, short_fit
 
 import lcplearn
-from lcplearn.datasets import Recordings, Task, simulate_sliding_block, windows
+from lcplearn.datasets import Recordings, Task, simulate_falling_block, simulate_sliding_block, windows
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.domains import NOT_NEGATIVE, Domain
 from lcplearn.formulations import MLP, Formulation, Identified, Physical, Slack, build, loss_terms
 from lcplearn.formulations.cube_corners import CubeCorners
 from lcplearn.formulations.identified import clip_rows
-from lcplearn.scenes import BouncingBlock, Drive, SlidingBlock, Step, slide
+from lcplearn.scenes import BouncingBlock, Drive, FallingBlock, SlidingBlock, Step, slide
 from lcplearn.scenes.planar_body import PlanarBody, rectangle
 from lcplearn.scenes.scene import Mode, Moving
 from lcplearn.scenes.space import Space
@@ -83,6 +83,17 @@ def test_a_spring_and_its_friction_are_learned_with_the_loop_closed(tmp_path: Pa
     assert fitted.metrics is not None
     assert fitted.metrics["stiffness_error"] <= 1e-5
     assert fitted.metrics["mu_error"] <= 1e-7
+
+
+def test_gravity_is_learned_from_falls_and_landings(tmp_path: Path) -> None:
+    task = simulate_falling_block(trajectories=6, length=40, long_length=60)
+    model = Identified(scene=FallingBlock, dt=task.dt, given=task.given, learn={"gravity": 5.0})
+    fitted = short_fit(model, task, tmp_path, loss={"rollout": 1.0}, horizon=10, epochs=80,
+                       optimizer=Optimizer(lbfgs_after=60), trainer=QUIET)  # fmt: skip
+    assert fitted.metrics is not None
+    assert fitted.metrics["gravity_error"] <= 1e-9
+    assert fitted.metrics["stick_accuracy"] == 1.0
+    assert model.rollout(task.test.states[:, 0], task.test.drive.force).positions.min() == 0.0
 
 
 def test_a_pulled_spring_holds_still_within_friction_and_swings_about_its_true_frequency() -> None:

@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from training.helpers import ROOT
 
-from lcplearn.datasets import Recordings, Task, simulate_sliding_block
+from lcplearn.datasets import Recordings, Task, simulate_falling_block, simulate_sliding_block
 from lcplearn.datasets.simulate_planar import simulate_planar_block, simulate_planar_body
 from lcplearn.datasets.spring import simulate_spring_block
 from lcplearn.formulations import FORMULATIONS, Formulation, build
@@ -43,6 +43,7 @@ def settings(*overrides: str) -> dict[str, Any]:
 EVERY = [f"{group}={name}" for group in ("model", "loss", "optimizer", "trainer", "logger") for name in names(group)]
 EVERY += [f"experiment={name}" for name in names("experiment")] + ["data=cube_slides model=mlp"]
 EVERY = [choice.replace("model=identified", "data=spring model=identified") for choice in EVERY]
+EVERY = [choice.replace("model=falling", "data=falling_block model=falling") for choice in EVERY]
 EVERY = [choice.replace("model=planar", "data=planar_block model=planar") for choice in EVERY]
 EVERY = [
     choice.replace("data=planar_block model=planar_body", "data=planar_body model=planar_body") for choice in EVERY
@@ -60,6 +61,7 @@ def tasks() -> dict[str, Task]:
     cube = Task(name="tosses", space=POSE, dt=0.01, train=one, validation=one, test=one, given=given)
     return {
         "sliding_block": simulate_sliding_block(trajectories=1, long_length=1),
+        "falling_block": simulate_falling_block(trajectories=1, long_length=1),
         "data=spring": simulate_spring_block(trajectories=1, long_length=1),
         "planar_body": simulate_planar_body(trajectories=1, length=2),
         "planar": simulate_planar_block(trajectories=1, long_length=1),

@@ -401,6 +401,8 @@ def test_the_last_epoch_is_validated_and_may_be_the_best(tmp_path: Path) -> None
 
 def test_without_any_force_no_mass_is_told(tmp_path: Path) -> None:
     data = tiny_data(force_std=0.0)
+    with pytest.raises(ValueError, match=r"^model: expected learn_mass=False \(model=physical_mu\)"):
+        short_fit(Physical(dt=data.dt), data, tmp_path / "run")
     result = short_fit(Structured(dt=data.dt), data, tmp_path / "run")
     assert set(result.model.physical_parameters()) == {"mu"}
     assert result.metrics is not None

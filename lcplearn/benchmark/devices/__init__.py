@@ -1,1 +1,1 @@
-"""`benchmark overhead`: what a call costs beside the solve."""
+"""`benchmark devices`: problems a second on a CUDA device, beside the CPU kernel."""

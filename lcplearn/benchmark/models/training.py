@@ -28,8 +28,8 @@ class Settings(NamedTuple):
     """How a formulation is trained.
 
     Attributes:
-        lr, adam, lbfgs: Adam's learning rate and epochs, then LBFGS iterations, 10 an epoch. Epochs in all are a
-            multiple of 10, because only every tenth is validated and can become the best.
+        lr, adam, lbfgs: Adam's learning rate and epochs, then LBFGS iterations, 10 an epoch. Every tenth epoch and the
+            last are validated, and can become the best.
         friction: Labels it learns from, if any.
         arguments: Of its constructor, beside dt and gravity.
         loss, horizon: Loss term, and steps of a window.

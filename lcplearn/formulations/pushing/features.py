@@ -48,7 +48,7 @@ def features(pushes: Pushes, thing: PushedObject, surface: Tensor | None = None)
     number = torch.zeros_like(angle) if surface is None else surface.to(angle.dtype)
     return Features(
         (body - thing.com) / RADIUS,
-        direction / direction.norm(dim=-1, keepdim=True),
+        direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-12),  # a finger that rests has none
         centre / RADIUS,
         torch.stack((angle.cos(), angle.sin()), -1),
         thing.outside(body).argmax(-1, keepdim=True).to(angle.dtype),
