@@ -126,7 +126,8 @@ def _polygon_gradient(problem: Problem, found: Answer, polygon: int, buckets: li
 def _at_rest(problem: Problem, found: Answer) -> Tensor:
     """Where contacts leave no velocity but 0: the rows that hold it have full rank.
 
-    A loaded contact that sticks holds all its directions, one that only touches (redundant corners) holds its normal.
+    A loaded contact with friction that sticks holds all its directions, one that only touches (redundant corners) or
+    has no friction its normal.
     Where contacts are compliant a normal speed within what the whole load would let a contact sink counts as none: else
     the load would go on moving from corner to corner.
     """
@@ -135,7 +136,7 @@ def _at_rest(problem: Problem, found: Answer) -> Tensor:
     limit = DEAD_ZONE * problem.speed_scale() + problem.compliance * found.normal.sum(-1, keepdim=True)
     touches = (normal_speed.abs() <= limit) & (problem.excess(found.velocity) <= limit)
     slip = torch.linalg.vector_norm(matvec(problem.tangents, found.velocity.unsqueeze(-2)), dim=-1)
-    holds = touches & (found.normal > 0.0) & (found.sticks | (slip <= DEAD_SLIP * problem.speed_scale()))
+    holds = touches & (problem.mu * found.normal > 0.0) & (found.sticks | (slip <= DEAD_SLIP * problem.speed_scale()))
     result = found.solved & found.settled & (touches.sum(-1) + directions * holds.sum(-1) >= nv)
     elements = torch.nonzero(result)[:, 0]
     if directions == 0 or not len(elements):

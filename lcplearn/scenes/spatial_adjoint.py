@@ -4,17 +4,22 @@ States, loads and friction forces are kept; all else of a step is computed anew.
 respect to x.
 """
 
-from collections.abc import Sequence
 from math import cos, sin, sqrt
 from typing import Any
 
-import numpy as np
-import torch
-from torch import Tensor
-
-from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
-from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, refuse_batched
-from lcplearn.scenes.spatial_kernel import SMALL, Options, Rolled, approach, roll, rotation
+from lcplearn.lcp.kernel.memory import address as data_address
+from lcplearn.scenes.contact_kernel.adjoint import UNKNOWN, pull_back_contacts
+from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, merged
+from lcplearn.scenes.contact_kernel.memory import (
+    adjoint_scratch,
+    bare,
+    bare_flags,
+    block,
+    grid,
+    loaded_memory,
+    row,
+)
+from lcplearn.scenes.spatial_kernel import SMALL, approach, jacobian, rotation
 
 
 @compiled
@@ -124,24 +129,19 @@ def _corner_back(c, R, rows_, gap_, radius, c_, R_, numbers_, x_):
 
 
 @compiled
-def _approach_memory(C):
-    """Free velocity, rows, gaps and closing speeds of C corners."""
-    return np.empty(6), np.empty((C, 6)), np.empty((C, 2, 6)), np.empty(C), np.empty(C)
-
-
-@compiled
-def _loaded_memory(C):
-    """Of the loaded contacts: rows, impulses, stick, mu, compliance, share of an impact, their numbers."""
-    return (
-        np.empty((3 * C, 6)), np.empty(3 * C), np.empty(C, np.bool_), np.empty(C), np.empty(C), np.empty(C),
-        np.empty(C, np.int64),
-    )  # fmt: skip
-
-
-@compiled
-def _loaded_gradients(C):
-    """With respect to rows, target, mu and compliance; and zeros, for the impulses, which are no result."""
-    return np.empty((3 * C, 6)), np.empty(C), np.empty(C), np.empty(C), np.zeros(3 * C)
+def _back_memory(at, C):
+    """Free velocity, rows, gaps and closing speeds of C corners; gradients of a step; and what follows."""
+    free, at = row(at, 6)
+    normal, at = grid(at, C, 6)
+    tangents, at = block(at, C, 2, 6)
+    gap, at = row(at, C)
+    closing, at = row(at, C)
+    free_, at = row(at, 6)
+    v_, at = row(at, 6)
+    x_, at = row(at, 13)
+    R, at = grid(at, 3, 3)
+    R_, at = grid(at, 3, 3)
+    return (free, normal, tangents, gap, closing), (free_, v_, x_, R_), R, at
 
 
 @compiled
@@ -169,7 +169,7 @@ def _contact_back(
     """Backwards through target and friction of the loaded contact i, to its corner and to the numbers."""
     _, normal, _, gap, closing = approached
     share, j = loaded[5][i], loaded[6][i]
-    rows_, target_, mu_, soft_, _ = gradients
+    rows_, _, target_, mu_, soft_ = gradients
     bounce_, gap_, closing_ = target_[i], -target_[i] / dt, 0.0
     if newton:
         bounce = numbers[1] * closing[j]
@@ -212,10 +212,66 @@ def _free_back(x, free, gyroscopic, mass, dt, force, free_, x_, force_, mass_, g
             x_[7 + k] += free_[k]
 
 
+@merged
+def _step_back(
+    known, at, C, dt, newton, gyroscopic, impact_speed, x, after, force, corners, mass, numbers, gravity, load,
+    friction, sticks, out, after_, force_, corners_, mass_, numbers_, gravity_,
+):  # fmt: skip
+    """Backwards through a step from x to after: adds to out, the gradient of x, and to those of all else.
+
+    known is as in `pull_back_contacts`, and is returned.
+    """
+    approached, (free_, v_, x_, R_), R, at = _back_memory(at, C)
+    loaded, gradients, at = loaded_memory(at, C, 6, 2)
+    free, normal, tangents, gap, closing = approached
+    rows, y, stuck, mu, soft, _, _ = loaded
+    rows_, nothing, target_, mu_, soft_ = gradients
+    rotation(x[3:7], R)
+    approach(x, R, gravity, force, corners, mass, numbers, dt, newton, gyroscopic, free, normal, gap, closing)
+    x_[:], R_[:, :], v_[:] = 0.0, 0.0, after_[7:]
+    for k in range(3):
+        x_[k] = after_[k]
+        v_[k] += dt * after_[k]
+    _turn_back(x, after, after[7:], dt, after_, v_, x_)
+    for i in range(C):
+        if load[i] > 0.0:
+            for d in range(2):
+                jacobian(corners, i, R, numbers[0], d, tangents[i, d])
+    K = _gather(load, friction, sticks, approached, numbers, impact_speed, loaded)
+    free_[:] = v_
+    if K:
+        nothing[:] = 0.0  # impulses are no result
+        known = pull_back_contacts(
+            known, K, 2, 6, rows, y, stuck, mu, soft, free, mass, v_, nothing, at, free_, rows_, target_, mu_, soft_,
+            mass_,
+        )  # fmt: skip
+    for i in range(K):
+        _contact_back(
+            i, dt, newton, impact_speed, x, R, corners, numbers, approached, loaded, gradients, corners_, R_, numbers_,
+            x_,
+        )  # fmt: skip
+    _free_back(x, free, gyroscopic, mass, dt, force, free_, x_, force_, mass_, gravity_)
+    _rotation_back(x, R_, x_)
+    for k in range(13):
+        out[k] += x_[k]
+    return known
+
+
+@compiled
+def _again(t, x, F):
+    """Whether step t + 1 is step t once more."""
+    other = 0
+    for k in range(13):
+        other += x[t, k] != x[t + 1, k]
+    for k in range(6):
+        other += F[t, k] != F[t + 1, k]
+    return other == 0
+
+
 def _make_roll_back(sources: str) -> Any:
     def _roll_back(
-        dt, newton, gyroscopic, rest, impact_speed, force, corners, mass, numbers, gravity, states, modes, solved,
-        loads, frictions, sticking, states_, force_, corners_, mass_, numbers_, gravity_,
+        scratch, dt, newton, gyroscopic, rest, impact_speed, force, corners, mass, numbers, gravity, states, modes,
+        solved, loads, frictions, sticking, states_, force_, corners_, mass_, numbers_, gravity_,
     ):  # fmt: skip
         """Gradients from that of the states; that of the start replaces states_[:, 0].
 
@@ -223,85 +279,28 @@ def _make_roll_back(sources: str) -> Any:
         """
         sources  # noqa: B018, for the cache
         B, T, C = len(states), force.shape[1], corners.shape[1]
-        memory, loaded, gradients = contact_memory(C, 6, 2), _loaded_memory(C), _loaded_gradients(C)
-        rows, y, sticks, mu, soft, _, _ = loaded
-        rows_, target_, mu_, soft_, nothing = gradients
-        approached = _approach_memory(C)
-        free, normal, tangents, gap, closing = approached
-        free_, v_, x_, R, R_ = np.empty(6), np.empty(6), np.empty(13), np.empty((3, 3)), np.empty((3, 3))
+        at = data_address(scratch)
         for b in range(B):
-            m = mass[b]
+            x, F, points, m, own = bare(states[b]), bare(force[b]), bare(corners[b]), bare(mass[b]), bare(numbers[b])
+            load, friction, sticks, down = bare(loads[b]), bare(frictions[b]), bare_flags(sticking[b]), bare(gravity[b])
+            x_, F_, points_, m_ = bare(states_[b]), bare(force_[b]), bare(corners_[b]), bare(mass_[b])
+            own_, down_ = bare(numbers_[b]), bare(gravity_[b])
+            known = UNKNOWN
             for t in range(T - 1, -1, -1):
-                if not solved[b, t]:
-                    continue
-                x, after, after_ = states[b, t], states[b, t + 1], states_[b, t + 1]
-                rotation(x[3:7], R)
-                approach(
-                    x, R, gravity[b], force[b, t], corners[b], m, numbers[b], dt, newton, gyroscopic, free, normal,
-                    tangents, gap, closing,
-                )  # fmt: skip
-                x_[:], R_[:, :] = 0.0, 0.0
-                v_[:] = after_[7:]
-                for k in range(3):
-                    x_[k] = after_[k]
-                    v_[k] += dt * after_[k]
-                _turn_back(x, after, after[7:], dt, after_, v_, x_)
-                K = _gather(loads[b, t], frictions[b, t], sticking[b, t], approached, numbers[b], impact_speed, loaded)
-                free_[:] = v_
-                if K:
-                    pull_back_contacts(
-                        K, 2, 6, rows, y, sticks, mu, soft, free, m, v_, nothing, memory, free_, rows_, target_, mu_,
-                        soft_, mass_[b],
+                if known != UNKNOWN and not _again(t, x, F):
+                    known = UNKNOWN
+                if solved[b, t]:
+                    known = _step_back(
+                        known, at, C, dt, newton, gyroscopic, impact_speed, x[t], x[t + 1], F[t], points, m, own, down,
+                        load[t], friction[t], sticks[t], x_[t], x_[t + 1], F_[t], points_, m_, own_, down_,
                     )  # fmt: skip
-                for i in range(K):
-                    _contact_back(
-                        i, dt, newton, impact_speed, x, R, corners[b], numbers[b], approached, loaded, gradients,
-                        corners_[b], R_, numbers_[b], x_,
-                    )  # fmt: skip
-                _free_back(x, free, gyroscopic, m, dt, force[b, t], free_, x_, force_[b, t], mass_[b], gravity_[b])
-                _rotation_back(x, R_, x_)
-                for k in range(13):
-                    states_[b, t, k] += x_[k]
 
     return compiled(_roll_back, cached=True)
 
 
-_roll_back = _make_roll_back(fingerprint("contact_gradient.py", "spatial_kernel.py", "spatial_adjoint.py"))
+roll_back = _make_roll_back(fingerprint("contact_gradient.py", "spatial_kernel.py", "spatial_adjoint.py"))
 
 
-def roll_out(options: Options, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """States [B, T + 1, 13], modes [B, T, C] and whether each step is right [B, T]; for what is given see `roll`."""
-    if torch.is_grad_enabled() and any(x.requires_grad for x in given):
-        found: tuple[Tensor, Tensor, Tensor] = _Rollout.apply(options, *given)
-        return found
-    states, modes, solved = (torch.from_numpy(x) for x in roll(given, options)[:3])
-    return states, modes, solved
-
-
-class _Rollout(torch.autograd.Function):
-    """Rollouts of a batch as one node."""
-
-    @staticmethod
-    def forward(ctx: Any, options: Options, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rolled = tuple(torch.from_numpy(x) for x in roll(given, options, keep=True))
-        ctx.options = options
-        ctx.save_for_backward(*given, *rolled)
-        states, modes, solved = rolled[:3]
-        ctx.mark_non_differentiable(modes, solved)
-        return states, modes, solved
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        refuse_batched((gradient,))
-        given, rolled = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
-        return (None, *pull_back(given, ctx.options, Rolled(*(x.detach().numpy() for x in rolled)), gradient))
-
-
-def pull_back(given: Sequence[Tensor], options: Options, rolled: Rolled, gradient: Tensor) -> list[Tensor]:
-    """Gradients with respect to what `roll` was given, from that with respect to the states."""
-    states_ = gradient.detach().clone(memory_format=torch.contiguous_format)
-    results = [torch.zeros_like(x, memory_format=torch.contiguous_format) for x in given[1:]]
-    values = [x.detach().contiguous().numpy() for x in given[1:]]
-    _roll_back(*options, *values, *rolled, states_.numpy(), *(x.numpy() for x in results))
-    return [states_[:, 0], *results]
+def back_scratch(C: int) -> int:
+    """Numbers of memory that `roll_back` needs."""
+    return 20 * C + 49 + adjoint_scratch(C, 6, 2)

@@ -139,8 +139,8 @@ class SpatialBody(Moving):
         shapes = (state.shape[:-1], force.shape[:-2], self.corners.shape[:-2], mass.shape[:-1], given.shape[:-1])
         batch = common_batch(*shapes, down.shape[:-1])
 
-        from lcplearn.scenes.spatial_adjoint import roll_out
         from lcplearn.scenes.spatial_kernel import Options
+        from lcplearn.scenes.spatial_node import roll_out
 
         found = roll_out(
             Options(

@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lcplearn.lcp.kernel.calling import call
+from lcplearn.lcp.kernel.jit import LARGEST
+from lcplearn.lcp.kernel.memory import address as data_address
 from lcplearn.lcp.pivoting import solver_address
 from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint
-from lcplearn.scenes.contact_kernel.steps import contacts_address
+from lcplearn.scenes.contact_kernel.memory import bare, contact_scratch, grid, row, step_memory
+from lcplearn.scenes.contact_kernel.steps import SEPARATION, contacts_address
 
 SMALL = 1e-8  # squared half angle below which series are exact; as in space.py
 
@@ -67,10 +70,8 @@ def _midpoint_spin(w, inertia, dt):
 
 
 @compiled
-def approach(
-    x, R, gravity, force, corners, mass, numbers, dt, newton, gyroscopic, free, normal, tangents, gap, closing
-):  # fmt: skip
-    """Free velocity, rows, gaps and closing speeds of all corners at a state x."""
+def approach(x, R, gravity, force, corners, mass, numbers, dt, newton, gyroscopic, free, normal, gap, closing):
+    """Free velocity, normals, gaps and closing speeds of all corners at a state x."""
     radius, ground = numbers[0], numbers[4]
     for i in range(3):
         free[i] = x[7 + i] + dt * (gravity[i] + force[i] / mass[i])
@@ -80,15 +81,9 @@ def approach(
     for i in range(3):
         free[3 + i] += dt * force[3 + i] / mass[3 + i]
     for i in range(len(corners)):
-        c = corners[i]
-        gap[i] = x[2] + R[2, 0] * c[0] + R[2, 1] * c[1] + R[2, 2] * c[2] - radius - ground
-        r0, r1, r2 = c[0] - radius * R[2, 0], c[1] - radius * R[2, 1], c[2] - radius * R[2, 2]
-        for d in range(3):
-            row = normal[i] if d == 2 else tangents[i, d]
-            row[0], row[1], row[2] = 1.0 * (d == 0), 1.0 * (d == 1), 1.0 * (d == 2)
-            row[3] = r1 * R[d, 2] - r2 * R[d, 1]
-            row[4] = r2 * R[d, 0] - r0 * R[d, 2]
-            row[5] = r0 * R[d, 1] - r1 * R[d, 0]
+        height = R[2, 0] * corners[i, 0] + R[2, 1] * corners[i, 1] + R[2, 2] * corners[i, 2]
+        gap[i] = x[2] + height - radius - ground
+        jacobian(corners, i, R, radius, 2, normal[i])
         before = after_free = 0.0
         for k in range(6):
             before += normal[i, k] * x[7 + k]
@@ -99,69 +94,109 @@ def approach(
             closing[i] = max(-before - max(gap[i], 0.0) / dt, 0.0)
 
 
+@compiled
+def jacobian(corners, i, R, radius, d, row):
+    """Of the lowest point of the sphere at corner i, along the world's axis d."""
+    r0 = corners[i, 0] - radius * R[2, 0]
+    r1 = corners[i, 1] - radius * R[2, 1]
+    r2 = corners[i, 2] - radius * R[2, 2]
+    row[0], row[1], row[2] = 1.0 * (d == 0), 1.0 * (d == 1), 1.0 * (d == 2)
+    row[3] = r1 * R[d, 2] - r2 * R[d, 1]
+    row[4] = r2 * R[d, 0] - r0 * R[d, 2]
+    row[5] = r0 * R[d, 1] - r1 * R[d, 0]
+
+
+@compiled
+def _aims(numbers, dt, newton, impact_speed, free, normal, gap, closing, target, mu, compliance):
+    """Target speed, friction and compliance of all corners; whether none of them closes in free flight."""
+    flies = True
+    for i in range(gap.size):
+        bounce, opening = numbers[1] * closing[i], 0.0
+        if newton and bounce > 0.0:
+            bounce = max(bounce + gap[i] / dt, 0.0)
+        target[i] = bounce - gap[i] / dt
+        mu[i] = numbers[2] + (numbers[3] - numbers[2]) * min(closing[i] / impact_speed, 1.0)
+        compliance[i] = numbers[5]
+        for k in range(6):
+            opening += normal[i, k] * free[k]
+        opening -= target[i]
+        flies = flies and 0.0 <= opening <= LARGEST
+    return flies
+
+
+@compiled
+def _stays(t, states, force):
+    """Whether the step before last left the body at rest, and nothing has pushed it since."""
+    if t < 2:
+        return False
+    moves = 0
+    for k in range(6):
+        moves += states[t - 1, 7 + k] != 0.0
+        moves += force[t, k] != force[t - 1, k]
+    return moves == 0
+
+
+@compiled
+def _move(x, v, at_rest, dt, after):
+    """The state after a step at a velocity; what rests keeps the last bit of its quaternion."""
+    for i in range(3):
+        after[i] = x[i] + dt * v[i]
+    for i in range(4):
+        after[3 + i] = x[3 + i]
+    for k in range(6):
+        after[7 + k] = v[k]
+    if not at_rest:
+        _turn(after[3:7], v[3:], dt)
+
+
 def _make_roll(sources: str) -> Any:
     def _roll(
-        contacts, address, dt, newton, gyroscopic, rest, impact_speed, start, force, corners, mass, numbers, gravity,
-        states, modes, solved, loads, frictions, sticking,
+        contacts, address, scratch, memory, dt, newton, gyroscopic, rest, impact_speed, start, force, corners, mass,
+        numbers, gravity, states, modes, solved, loads, frictions, sticking,
     ):  # fmt: skip
         """T steps of each element; numbers are radius, restitution, mu, mu_impact, ground, compliance."""
         sources  # noqa: B018, for the cache
         B, T, C = len(start), force.shape[1], corners.shape[1]
-        # what `contact_kernel` takes and gives, for a batch of one
-        normal, tangents = np.empty((1, C, 6)), np.empty((1, C, 2, 6))
-        target, friction_mu, soft = np.empty((1, C)), np.empty((1, C)), np.empty((1, C))
-        load, friction, sticks = np.empty((1, C)), np.empty((1, C, 2)), np.empty((1, C), np.bool_)
-        free_now, mass_now, v_now = np.empty((1, 6)), np.empty((1, 6)), np.empty((1, 6))
-        mode, flags = np.empty((1, C), np.int64), np.empty((1, 3), np.bool_)
-        free, v = free_now[0], v_now[0]
-        R, q, gap, closing = np.empty((3, 3)), np.empty(4), np.empty(C), np.empty(C)
+        given, found, at = step_memory(data_address(memory), C, 6)
+        target, normal, tangents, mu, compliance, free, mass_now = given
+        v, load, friction, mode, sticks, flags = found
+        R, at = grid(at, 3, 3)
+        gap, at = row(at, C)
+        closing, at = row(at, C)
+        kept = len(loads) > 0  # somebody will ask for the gradient
         for b in range(B):
-            states[b, 0] = start[b]
-            mass_now[0] = m = mass[b]
-            restitution, mu, mu_impact, compliance = numbers[b, 1], numbers[b, 2], numbers[b, 3], numbers[b, 5]
+            x, F, points, m, own = bare(states[b]), bare(force[b]), bare(corners[b]), bare(mass[b]), bare(numbers[b])
+            down = bare(gravity[b])
+            x[0], mass_now[0] = start[b], m
             at_rest = False
             for t in range(T):
-                x, after = states[b, t], states[b, t + 1]
-                if at_rest and t > 1 and (states[b, t - 1, 7:] == 0.0).all() and (force[b, t] == force[b, t - 1]).all():
-                    after[:] = x  # the step before, again
+                if at_rest and _stays(t, x, F):
+                    x[t + 1] = x[t]  # the step before, again
                     modes[b, t], solved[b, t] = modes[b, t - 1], solved[b, t - 1]
-                    if len(loads):
+                    if kept:
                         loads[b, t], frictions[b, t] = loads[b, t - 1], frictions[b, t - 1]
                         sticking[b, t] = sticking[b, t - 1]
                     continue
-                for i in range(4):
-                    q[i] = x[3 + i]
-                rotation(q, R)
+                rotation(x[t, 3:7], R)
                 approach(
-                    x, R, gravity[b], force[b, t], corners[b], m, numbers[b], dt, newton, gyroscopic, free, normal[0],
-                    tangents[0], gap, closing,
+                    x[t], R, down, F[t], points, m, own, dt, newton, gyroscopic, free[0], normal[0], gap, closing
                 )  # fmt: skip
-                for i in range(C):
-                    bounce = restitution * closing[i]
-                    if newton and bounce > 0.0:
-                        bounce = max(bounce + gap[i] / dt, 0.0)
-                    target[0, i] = bounce - gap[i] / dt
-                    friction_mu[0, i] = mu + (mu_impact - mu) * min(closing[i] / impact_speed, 1.0)
-                    soft[0, i] = compliance
-                call(
-                    contacts,
-                    (
-                        address, rest, target, normal, tangents, friction_mu, soft, free_now, mass_now, v_now, load,
-                        friction, mode, sticks, flags,
-                    ),
-                )  # fmt: skip
+                if _aims(
+                    own, dt, newton, impact_speed, free[0], normal[0], gap, closing, target[0], mu[0], compliance[0]
+                ):  # fmt: skip
+                    v[0], load[0], friction[0], mode[0], sticks[0] = free[0], 0.0, 0.0, SEPARATION, False
+                    flags[0, 0], flags[0, 1], flags[0, 2] = True, True, False
+                else:
+                    for i in range(C):
+                        for d in range(2):
+                            jacobian(points, i, R, own[0], d, tangents[0, i, d])
+                    call(contacts, (address, rest, scratch, *given, *found))
                 at_rest = flags[0, 2]
                 solved[b, t] = flags[0, 0] and flags[0, 1]
                 modes[b, t] = mode[0]
-                if len(loads):  # somebody will ask for the gradient
+                if kept:
                     loads[b, t], frictions[b, t], sticking[b, t] = load[0], friction[0], sticks[0]
-                if not at_rest:  # else a quaternion could change its last bit
-                    _turn(q, v[3:], dt)
-                after[7:] = v
-                for i in range(3):
-                    after[i] = x[i] + dt * v[i]
-                for i in range(4):
-                    after[3 + i] = q[i]
+                _move(x[t], v[0], at_rest, dt, x[t + 1])
 
     return compiled(_roll, cached=True)
 
@@ -209,5 +244,9 @@ def roll(given: Sequence[Tensor], options: Options, *, keep: bool = False) -> Ro
         np.empty((B, T + 1, 13)), np.empty((B, T, C), np.int64), np.empty((B, T), np.bool_), np.empty((kept, T, C)),
         np.empty((kept, T, C, 2)), np.empty((kept, T, C), np.bool_),
     )  # fmt: skip
-    _roll(contacts_address(), solver_address(), *options, start, force, corners, mass, numbers, gravity, *rolled)
+    scratch, memory = np.empty(contact_scratch(C, 6)), np.empty(32 * C + 28)
+    _roll(
+        contacts_address(), solver_address(), scratch, memory, *options, start, force, corners, mass, numbers, gravity,
+        *rolled,
+    )  # fmt: skip
     return rolled

@@ -22,6 +22,7 @@ from lcplearn.scenes.contact import (
     rebound,
 )
 from lcplearn.scenes.contact_solve import _iterate, find
+from lcplearn.scenes.spatial_body import box_corners
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -36,6 +37,54 @@ def test_what_the_needed_rows_give_solves_the_law_of_all_contacts(seed):
         right, wrong = step.solved & step.settled, violation(*scene, step)
         assert (right & (wrong < 1e-12)).sum() >= 29  # of a million boxes one does not settle, nine to 6e-10 only
         assert wrong[right].amax() < 1e-9
+
+
+@pytest.mark.parametrize("seed", [5121, 5132])
+def test_what_counts_as_settled_obeys_the_law(seed):
+    """Among 3000 boxes is one whose corner opens, closes again and then slips along an axis that it had not before."""
+    scene = boxes(3000, seed)
+    step = contact_step(*scene, DT, rest=False)
+    assert (step.solved & step.settled).all()
+    assert violation(*scene, step).amax() < 1e-9
+
+
+def test_a_box_on_corners_that_contradict_each_other_rests_as_by_the_lcps(monkeypatch):
+    """What violates the law by less than a slip that counts as none is only taken where it is at rest."""
+    pytest.importorskip("numba")
+    scene = resting_boxes(1000, 4)
+    step = contact_step(*scene, DT)
+    monkeypatch.setattr("lcplearn.scenes.contact.compiled_contacts", lambda device: None)
+    expected = contact_step(*scene, DT)
+    right = step.solved & step.settled & expected.solved & expected.settled
+    assert right.sum() >= 999
+    assert (step.at_rest != expected.at_rest).sum() <= 1  # corners creep at what just counts as none
+    both = right & (step.at_rest == expected.at_rest)
+    assert step.at_rest.sum() > 50
+    assert (step.velocity - expected.velocity)[both & (scene[0].compliance[:, 0] > 0.0)].abs().amax() < 1e-9
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("speed", [1e-9, 1e-12])
+def test_a_block_on_ice_is_not_at_rest_however_slowly_it_slides(compiled, speed, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr("lcplearn.scenes.contact.compiled_contacts", lambda device: None)
+    mass = torch.tensor([[0.3] * 3 + [5e-4] * 3])
+    corners = box_corners(torch.tensor([0.05, 0.05, 0.05]))
+    linear = torch.eye(3).expand(8, 3, 3)
+    rows = torch.cat((linear, torch.linalg.cross(corners.unsqueeze(-2).expand(8, 3, 3), linear)), dim=-1)
+    contacts = Contacts(
+        gap=corners[:, 2] + 0.05,
+        normal=rows[:, 2],
+        tangents=rows[:, :2],
+        mu=torch.zeros(8),
+        bounce=torch.zeros(8),
+        compliance=torch.full((8,), 1e-3),
+    )
+    free = torch.tensor([speed, 0.0, -9.81 * DT, 0.0, 0.0, 0.0])
+    step = contact_step(contacts, free, mass[0], DT)
+    assert step.solved
+    assert not step.at_rest
+    assert abs(float(step.velocity[0]) - speed) < 1e-3 * speed
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -319,6 +368,21 @@ def test_the_compiled_step_and_its_gradient_are_those_of_torch(scene, compliance
     close = 1e-9 if compliance else 1e-11  # a small compliance makes loads unique, and sensitive
     for mine, wanted in zip(gradients, expected, strict=True):
         torch.testing.assert_close(mine, wanted, rtol=0, atol=close * float(1.0 + wanted.abs().amax()))
+
+
+def test_views_of_an_elements_memory_lie_apart_and_within_it():
+    pytest.importorskip("numba")
+    from lcplearn.scenes.contact_kernel.memory import cone_memory, contact_scratch, element_memory, modes_memory
+
+    for C, nv in ((1, 3), (2, 6), (8, 6), (8, 12), (30, 2)):
+        memory = np.empty(contact_scratch(C, nv))
+        start = memory.ctypes.data
+        whole, part, after = element_memory(start, C, nv)
+        for more in (modes_memory(after, C, nv), cone_memory(after, C, nv)):
+            spans = sorted((x.ctypes.data, x.ctypes.data + x.nbytes) for x in (*whole, *part, *more))
+            assert spans[0][0] == start
+            assert all(end <= following for (_, end), (following, _) in itertools.pairwise(spans))
+            assert spans[-1][1] <= start + memory.nbytes
 
 
 def test_compiled_code_is_found_by_the_types_it_is_for():

@@ -15,7 +15,7 @@ from lcplearn.benchmark.epoch.clock import Clock, Times
 from lcplearn.benchmark.harness.study import Table, Value, format_table
 from lcplearn.datasets import WindowLoader
 from lcplearn.lcp import gradient
-from lcplearn.scenes import spatial_adjoint
+from lcplearn.scenes import spatial_node
 from lcplearn.scenes.contact_kernel import steps
 from lcplearn.training.module import FormulationModule
 from lcplearn.training.writing import AtomicCheckpointIO
@@ -25,10 +25,10 @@ REST = "Lightning, callbacks, the rest"
 PLACES = (
     ("solve", gradient, "solve"),
     ("solve", steps, "_solve"),
-    ("solve", spatial_adjoint, "roll"),
+    ("solve", spatial_node, "roll"),
     ("solve, backward", gradient, "adjoint"),
     ("solve, backward", steps._Contacts, "backward"),
-    ("solve, backward", spatial_adjoint, "pull_back"),
+    ("solve, backward", spatial_node, "pull_back"),
     ("model and loss", FormulationModule, "_terms"),
     ("model and loss", FormulationModule, "_total"),
     ("torch, backward", FormulationModule, "manual_backward"),

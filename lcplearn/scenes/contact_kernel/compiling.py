@@ -18,6 +18,11 @@ def compiled(function: Any, cached: bool = False) -> Any:
     return jit.cached(function) if cached else jit.jit(function)
 
 
+def merged(function: Any) -> Any:
+    """As `compiled`, but as part of its only caller: to pass many arrays takes longer than what is done to them."""
+    return jit.jit_merged(unwrap(function))
+
+
 def fingerprint(*files: str) -> str:
     """Of the sources of a compiled function, in this folder and elsewhere.
 

@@ -4,8 +4,8 @@ from math import sqrt
 
 import numpy as np
 
-from lcplearn.lcp.kernel.memory import scratch_size
 from lcplearn.scenes.contact_kernel.compiling import compiled
+from lcplearn.scenes.contact_kernel.memory import cone_memory
 from lcplearn.scenes.contact_kernel.rows import apply, condense, cone_rows, delassus, mass_norm, rotate, solve_lcp
 from lcplearn.scenes.friction_lcp import (
     CRUDE,
@@ -18,17 +18,6 @@ from lcplearn.scenes.friction_lcp import (
 )
 
 _regularisation = compiled(regularisation)
-
-
-@compiled
-def workspace(C, nv):
-    """Memory for the LCPs of an element with C contacts."""
-    n = 3 * C
-    return (
-        np.empty((n, n)), np.empty((n, n)), np.empty((C, C)), np.empty((C, n)), np.empty(n * n), np.empty(n),
-        np.empty(n), np.empty(n), np.empty((C, 2)), np.empty(C), np.empty(n), np.empty(nv), np.empty(n), np.empty(C),
-        np.empty((C, 2)), np.empty(scratch_size(n)), np.empty(4 * n + 8), np.empty(C), np.empty(C),
-    )  # fmt: skip
 
 
 @compiled
@@ -89,11 +78,11 @@ def _read(K, axes, root, X, D, u, mu, z, w, load, friction, slip, sticks, force,
 
 @compiled
 def solve_cone(
-    address, K, nv, rows, target, mu, compliance, free, mass, scale, numbers, v, load, friction, slip, sticks
-):
+    address, K, nv, rows, target, mu, compliance, free, mass, scale, at, v, load, friction, slip, sticks
+):  # fmt: skip
     """Iterate the cone of K contacts; whether it was solved, and whether it settled."""
     D, A, H, X, M, q, u, r, axes, root, impulse, v_new, force, old_load, old_friction, scratch, out, soft, goal = (
-        numbers
+        cone_memory(at, K, nv)
     )
     n = 3 * K
     delassus(rows, mass, free, n, nv, D, u)

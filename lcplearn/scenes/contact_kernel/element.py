@@ -5,18 +5,18 @@ from math import sqrt
 import numpy as np
 
 from lcplearn.lcp.kernel.jit import LARGEST
-from lcplearn.scenes.contact_kernel.compiling import compiled
+from lcplearn.scenes.contact_kernel.compiling import compiled, merged
 from lcplearn.scenes.contact_kernel.cone import solve_cone
+from lcplearn.scenes.contact_kernel.memory import cone_memory, element_memory
+from lcplearn.scenes.contact_kernel.modes import settle_modes
 from lcplearn.scenes.contact_kernel.rows import apply, cholesky, cone_rows, delassus, mass_norm, solve_lcp
-from lcplearn.scenes.friction_lcp import DEAD_SLIP, DEAD_ZONE, FULL_RANK, ROUNDING
+from lcplearn.scenes.friction_lcp import DEAD_SLIP, DEAD_ZONE, FULL_RANK, ROUNDING, SETTLED
 
 
 @compiled
-def _solve_plane(address, K, nv, T, rows, target, mu, compliance, free, mass, numbers, v, load, friction, slip, sticks):
+def _solve_plane(address, K, nv, T, rows, target, mu, compliance, free, mass, at, v, load, friction, slip, sticks):
     """The LCP of K contacts with at most one friction direction; whether it was solved."""
-    D, M, q, u, impulse, scratch, out = (
-        numbers[0], numbers[4], numbers[5], numbers[6], numbers[10], numbers[15], numbers[16]
-    )  # fmt: skip
+    D, _, _, _, M, q, u, _, _, _, impulse, _, _, _, _, scratch, out, _, _ = cone_memory(at, K, nv)
     count = (T + 1) * K
     delassus(rows, mass, free, count, nv, D, u)
     if T == 0:
@@ -42,8 +42,8 @@ def _solve_plane(address, K, nv, T, rows, target, mu, compliance, free, mass, nu
     return solved
 
 
-@compiled
-def _rests(C, nv, T, target, normal, tangents, compliance, mass, scale, v, load, sticks, gram):
+@merged
+def _rests(C, nv, T, target, normal, tangents, mu, compliance, mass, scale, v, load, sticks, gram):
     """As `contact_solve._at_rest`."""
     if T == 0:
         return False
@@ -64,7 +64,7 @@ def _rests(C, nv, T, target, normal, tangents, compliance, mass, scale, v, load,
             for k in range(nv):
                 along += tangents[i, d, k] * v[k]
             slip += along * along
-        holds = load[i] > 0.0 and (sticks[i] or sqrt(slip) <= DEAD_SLIP * scale[i])
+        holds = mu[i] * load[i] > 0.0 and (sticks[i] or sqrt(slip) <= DEAD_SLIP * scale[i])
         kept = 1 + (T if holds else 0)
         held += kept
         for d in range(kept):
@@ -94,26 +94,32 @@ def _members(active, index):
 
 
 @compiled
-def _closing(C, nv, target, normal, free, mass, scale, active):
-    """How many contacts close in free flight, and whether all is finite; scale is `Problem.speed_scale`."""
-    finite, count, demanded = True, 0, 0.0
+def _to_scale(count, target, energy, scale):
+    """From roots of mobilities to `Problem.speed_scale`, in place."""
+    demanded = 0.0
+    for i in range(count):
+        demanded = max(demanded, target[i] / max(scale[i], 1e-300))
+    for i in range(count):
+        scale[i] *= energy + demanded
+
+
+@merged
+def _closing(C, nv, target, normal, free, mass, active, unit):
+    """How many contacts close in free flight, and whether all is finite; unit are the roots of mobilities."""
+    finite, count = True, 0
     for i in range(C):
         speed, alone = 0.0, 0.0
         for k in range(nv):
             speed += normal[i, k] * free[k]
             alone += normal[i, k] ** 2 / mass[k]
-        scale[i] = sqrt(alone)
-        demanded = max(demanded, target[i] / max(scale[i], 1e-300))
+        unit[i] = sqrt(alone)
         active[i] = speed - target[i] < 0.0
         count += active[i]
         finite = finite and abs(speed - target[i]) <= LARGEST
-    size = mass_norm(mass, free, nv) + demanded
-    for i in range(C):
-        scale[i] *= size
     return count, finite
 
 
-@compiled
+@merged
 def _wrong(C, nv, target, normal, v, scale, active):
     """How many contacts without rows the solution violates, and whether all is finite; they become active."""
     finite, count = True, 0
@@ -128,36 +134,52 @@ def _wrong(C, nv, target, normal, v, scale, active):
     return count, finite
 
 
-@compiled
-def solve_element(
-    address, C, nv, T, rest, target, normal, tangents, mu, compliance, free, mass, numbers, part, rows, index, active,
-    gram, scale, v, load, friction, sticks,
+@merged
+def _solve_needed(
+    address, C, nv, T, near, target, normal, tangents, mu, compliance, free, mass, at, v, load, friction, sticks
 ):  # fmt: skip
-    """Solve the contacts of one element: solved, settled, at rest. What is not needed is left out, then checked."""
-    part_target, part_mu, part_compliance, part_scale, part_load, part_friction, part_slip, part_sticks = part
-    added, finite = _closing(C, nv, target, normal, free, mass, scale, active)
+    """What closes has rows, then what the solution is wrong about: solved, settled, and whether it is only near.
+
+    Near is a solution that violates the law by less than a slip that counts as none; it is taken if near is true.
+    """
+    (active, index, unit, scale, _), part, at = element_memory(at, C, nv)
+    rows, part_target, part_mu, part_compliance, part_scale, part_load, part_friction, part_slip, part_sticks = part
+    accepted = DEAD_SLIP if near else SETTLED
+    added, finite = _closing(C, nv, target, normal, free, mass, active, unit)
+    energy = mass_norm(mass, free, nv)
+    scale[:] = unit
+    _to_scale(C, target, energy, scale)
     load[:], sticks[:], v[:] = 0.0, False, free
     for i in range(C):
         for d in range(T):
             friction[i, d] = 0.0
-    solved, settled = finite, True
+    solved, settled, wrong = finite, True, 0.0
     while added > 0:
         K = _members(active, index)
         for i in range(K):
             j = index[i]
-            part_target[i], part_mu[i], part_compliance[i], part_scale[i] = target[j], mu[j], compliance[j], scale[j]
+            part_target[i], part_mu[i], part_compliance[i], part_scale[i] = target[j], mu[j], compliance[j], unit[j]
             for k in range(nv):
                 rows[i, k] = normal[j, k]
                 for d in range(T):
                     rows[(d + 1) * K + i, k] = tangents[j, d, k]
+        _to_scale(K, part_target, energy, part_scale)
+        wrong = np.inf
         if T == 2:
+            wrong = settle_modes(
+                K, nv, rows, part_target, part_mu, part_compliance, free, mass, part_scale, at, v, part_load,
+                part_friction, part_slip, part_sticks,
+            )  # fmt: skip
+        if wrong <= accepted:
+            solved, settled = True, wrong <= SETTLED
+        elif T == 2:
             solved, settled = solve_cone(
-                address, K, nv, rows, part_target, part_mu, part_compliance, free, mass, part_scale, numbers, v,
+                address, K, nv, rows, part_target, part_mu, part_compliance, free, mass, part_scale, at, v,
                 part_load, part_friction, part_slip, part_sticks,
             )  # fmt: skip
         else:
             solved = _solve_plane(
-                address, K, nv, T, rows, part_target, part_mu, part_compliance, free, mass, numbers, v, part_load,
+                address, K, nv, T, rows, part_target, part_mu, part_compliance, free, mass, at, v, part_load,
                 part_friction, part_slip, part_sticks,
             )  # fmt: skip
             settled = solved
@@ -168,20 +190,27 @@ def solve_element(
                 friction[j, d] = part_friction[i, d]
         added, still_finite = _wrong(C, nv, target, normal, v, scale, active)
         finite = finite and still_finite
-    solved = solved and finite
-    at_rest = (
-        rest
-        and solved
-        and settled
-        and _rests(C, nv, T, target, normal, tangents, compliance, mass, scale, v, load, sticks, gram)
-    )
-    return solved, settled, at_rest
+    return solved and finite, settled, not settled and wrong <= accepted
 
 
-@compiled
-def parts(C):
-    """Memory for the contacts that an element needs."""
-    return (
-        np.empty(C), np.empty(C), np.empty(C), np.empty(C), np.empty(C), np.empty((C, 2)), np.empty((C, 2)),
-        np.empty(C, np.bool_),
-    )  # fmt: skip
+@merged
+def solve_element(
+    address, C, nv, T, rest, target, normal, tangents, mu, compliance, free, mass, at, v, load, friction, sticks
+):  # fmt: skip
+    """Solve the contacts of one element: solved, settled, at rest."""
+    (_, _, _, scale, gram), _, _ = element_memory(at, C, nv)
+    near = rest
+    while True:
+        solved, settled, near = _solve_needed(
+            address, C, nv, T, near, target, normal, tangents, mu, compliance, free, mass, at, v, load, friction,
+            sticks,
+        )  # fmt: skip
+        at_rest = (
+            rest
+            and solved
+            and (settled or near)
+            and _rests(C, nv, T, target, normal, tangents, mu, compliance, mass, scale, v, load, sticks, gram)
+        )
+        if at_rest or not near:
+            return solved, settled or at_rest, at_rest
+        near = False

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from lcplearn.lcp.kernel.calling import address_of
+from lcplearn.lcp.kernel.memory import address as data_address
 from lcplearn.lcp.pivoting import solver_address
 from lcplearn.scenes.contact import ContactStep
-from lcplearn.scenes.contact_kernel.adjoint import contact_memory, pull_back_contacts
+from lcplearn.scenes.contact_kernel.adjoint import UNKNOWN, pull_back_contacts
 from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, refuse_batched
-from lcplearn.scenes.contact_kernel.cone import workspace
-from lcplearn.scenes.contact_kernel.element import parts, solve_element
+from lcplearn.scenes.contact_kernel.element import solve_element
+from lcplearn.scenes.contact_kernel.memory import adjoint_scratch, bare, bare_flags, contact_scratch, loaded_memory
 from lcplearn.scenes.friction_lcp import Problem
 
 STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
@@ -22,19 +23,22 @@ STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
 
 def _make_solve_all(sources: str) -> Any:
     def _solve_all(
-        address, rest, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, modes, sticks,
-        flags,
+        address, rest, scratch, target, normal, tangents, mu, compliance, free, mass, velocity, load, friction, modes,
+        sticks, flags,
     ):  # fmt: skip
         sources  # noqa: B018, for the cache
         B, C, nv = normal.shape
         T = tangents.shape[2]
-        numbers, part = workspace(C, nv), parts(C)
-        rows, index, active = np.empty((3 * C, nv)), np.empty(C, np.int64), np.empty(C, np.bool_)
-        gram, scale = np.empty((nv, nv)), np.empty(C)
+        at = data_address(scratch)
+        target, normal, tangents, mu, compliance = (
+            bare(target), bare(normal), bare(tangents), bare(mu), bare(compliance)
+        )  # fmt: skip
+        free, mass, velocity, load, friction = bare(free), bare(mass), bare(velocity), bare(load), bare(friction)
+        sticks, flags = bare_flags(sticks), bare_flags(flags)
         for b in range(B):
             flags[b, 0], flags[b, 1], flags[b, 2] = solve_element(
                 address, C, nv, T, rest, target[b], normal[b], tangents[b], mu[b], compliance[b], free[b], mass[b],
-                numbers, part, rows, index, active, gram, scale, velocity[b], load[b], friction[b], sticks[b],
+                at, velocity[b], load[b], friction[b], sticks[b],
             )  # fmt: skip
             at_rest = flags[b, 2]
             if at_rest:
@@ -49,18 +53,19 @@ def _make_solve_all(sources: str) -> Any:
 
 def _make_pull_back_all(sources: str) -> Any:
     def _pull_back_all(
-        normal, tangents, mu, compliance, free, mass, load, friction, sticks, flags, velocity_, load_, friction_,
-        target_, normal_, tangents_, mu_, compliance_, free_, mass_,
+        scratch, normal, tangents, mu, compliance, free, mass, load, friction, sticks, flags, velocity_, load_,
+        friction_, target_, normal_, tangents_, mu_, compliance_, free_, mass_,
     ):  # fmt: skip
         """Gradients, from those of velocity, load and friction, for the contacts that are loaded; the rest are 0."""
         sources  # noqa: B018, for the cache
         B, C, nv = normal.shape
         T = tangents.shape[2]
         w = 1 + T
-        memory = contact_memory(C, nv, T)
-        rows, rows_, y, y_ = np.empty((w * C, nv)), np.empty((w * C, nv)), np.empty(w * C), np.empty(w * C)
-        stuck, part_mu, soft, index = np.empty(C, np.bool_), np.empty(C), np.empty(C), np.empty(C, np.int64)
-        part_target_, part_mu_, part_soft_ = np.empty(C), np.empty(C), np.empty(C)
+        loaded, gradients, at = loaded_memory(data_address(scratch), C, nv, T)
+        rows, y, stuck, part_mu, soft, _, index = loaded
+        rows_, y_, part_target_, part_mu_, part_soft_ = gradients
+        normal, tangents, free, mass = bare(normal), bare(tangents), bare(free), bare(mass)
+        velocity_, free_, mass_ = bare(velocity_), bare(free_), bare(mass_)
         for b in range(B):
             if not flags[b, 0]:
                 continue
@@ -77,8 +82,8 @@ def _make_pull_back_all(sources: str) -> Any:
             if K == 0:
                 continue
             pull_back_contacts(
-                K, T, nv, rows, y, stuck, part_mu, soft, free[b], mass[b], velocity_[b], y_, memory, free_[b], rows_,
-                part_target_, part_mu_, part_soft_, mass_[b],
+                UNKNOWN, K, T, nv, rows, y, stuck, part_mu, soft, free[b], mass[b], velocity_[b], y_, at, free_[b],
+                rows_, part_target_, part_mu_, part_soft_, mass_[b],
             )  # fmt: skip
             for i in range(K):
                 j = index[i]
@@ -100,7 +105,8 @@ def contacts_address() -> int:
     one, row, rows = np.ones((1, 1)), np.ones((1, 1, 1)), np.ones((1, 1, 1, 1))
     modes, flags = np.ones((1, 1), np.int64), np.ones((1, 1), np.bool_)
     return address_of(
-        _solve_all, solver_address(), True, one, row, rows, one, one, one, one, one, one, row, modes, flags, flags
+        _solve_all, solver_address(), True, np.ones(1), one, row, rows, one, one, one, one, one, one, row, modes, flags,
+        flags,
     )  # fmt: skip
 
 
@@ -132,7 +138,8 @@ def _solve(problem: Iterable[Tensor], rest: bool) -> Solved:
         np.empty_like(free), np.empty_like(target), np.empty(tangents.shape[:3]), np.empty(target.shape, np.int64),
         np.empty(target.shape, np.bool_), np.empty((len(free), 3), np.bool_),
     )  # fmt: skip
-    _solve_all(solver_address(), rest, *arrays, *found)
+    scratch = np.empty(contact_scratch(tangents.shape[1], tangents.shape[3]))
+    _solve_all(solver_address(), rest, scratch, *arrays, *found)
     return found
 
 
@@ -152,6 +159,8 @@ class _Contacts(torch.autograd.Function):
         given, found = saved[: len(Problem._fields)], saved[len(Problem._fields) :]
         results = [np.zeros(x.shape) for x in given]
         wanted = [x.contiguous().numpy() for x in gradients[:3]]
-        _pull_back_all(*given[1:], *found, *wanted, *results)
+        _, C, T, nv = given[2].shape
+        scratch = np.empty(adjoint_scratch(C, nv, T))
+        _pull_back_all(scratch, *given[1:], *found, *wanted, *results)
         wants = ctx.needs_input_grad[1:]
         return (None, *(torch.from_numpy(x) if want else None for x, want in zip(results, wants, strict=True)))
