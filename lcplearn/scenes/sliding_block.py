@@ -225,7 +225,8 @@ class SlidingBlock(Moving):
             return z[..., 0] - z[..., 1], solution
         v = self._free_velocity(velocity, force) + self.dt / self.mass * (z[..., 0] - z[..., 1])
         gamma = z[..., 2]
-        return torch.minimum(torch.maximum(v, -gamma), gamma), solution
+        held = torch.minimum(torch.maximum(v, -gamma), gamma)
+        return torch.where(gamma == 0.0, 0.0, held), solution  # at rest a tie of bounds would have a gradient
 
     def _free_velocity(self, velocity: Tensor, force: Tensor) -> Tensor:
         return velocity + force * self.dt / self.mass

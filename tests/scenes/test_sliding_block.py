@@ -256,3 +256,13 @@ def test_a_softened_threshold_has_all_digits_of_its_numbers():
     velocity, force = torch.tensor([2.0, -2.0], dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     soft, hard = (block(temperature=t).next_velocity(velocity, force) for t in (1e-6, 0.0))
     torch.testing.assert_close(soft, hard, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_block_at_rest_that_nothing_pushes_has_no_gradient(form):
+    """Friction could hold more: the velocity is 0 all around."""
+    inputs = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.0, 0.0, MU, MASS)]
+    velocity, force, mu, mass = inputs
+    after = SlidingBlock(mass, mu, DT, form=form).next_velocity(velocity, force)
+    gradients = torch.autograd.grad(after, inputs, allow_unused=True)
+    assert [0.0 if slope is None else float(slope) for slope in gradients] == [0.0] * 4
