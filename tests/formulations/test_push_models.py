@@ -12,6 +12,12 @@ from real_data import real_data
 
 from lcplearn.datasets.pushes import PushData, read_all_pushes
 from lcplearn.formulations.pushing import PushMLP, Residual, Ridge, Supports
+from lcplearn.formulations.pushing.baselines import _kernel
+from lcplearn.formulations.pushing.features import features
+from lcplearn.formulations.pushing.gauss_newton import least_deviation
+from lcplearn.formulations.pushing.process import LATENTS, Process
+from lcplearn.formulations.pushing.residual import BESIDE, INSIDE
+from lcplearn.scenes.pushed_object import PushedObject
 from lcplearn.training.checkpoint import load
 
 F = torch.float64
@@ -160,3 +166,71 @@ def test_three_numbers_tell_where_real_pushes_end():
     found = model.physical_parameters()
     assert found["mu_hardboard"] == pytest.approx(0.300, abs=0.02)
     assert found["mu_wood"] == pytest.approx(0.346, abs=0.02)
+
+
+def test_ridge_chooses_by_the_error_of_each_push_without_itself(data, known):
+    """Leaving one out by its formula is leaving one out."""
+    (_, outcome), model = known, Ridge(**thing(data))
+    told = next(model.fit(data.pushes, outcome))["deviation_mm"]
+    motion, seen = 1e3 * model.motion(data.pushes, outcome.pose), features(data.pushes, model.object)
+    centred = motion - motion.mean(0)
+    chosen = torch.tensor((Ridge.WIDTHS[0], Ridge.DIRECTIONS[0], Ridge.SHARES[0]), dtype=F)
+    kernel, errors = _kernel(seen, seen, chosen), []
+    torch.testing.assert_close(kernel.diagonal(), torch.full((24,), 1.0 + Ridge.SHARES[0], dtype=F))
+    other = seen._replace(geometry=seen.geometry + 1.0)  # one never seen: the common function is left
+    torch.testing.assert_close(_kernel(other, seen, chosen).diagonal(), torch.ones(24, dtype=F))
+    for penalty in Ridge.PENALTIES:
+        left = []
+        for k in range(24):
+            rest = torch.arange(24) != k
+            weights = torch.linalg.solve(kernel[rest][:, rest] + penalty * torch.eye(23, dtype=F), centred[rest])
+            left.append((kernel[k, rest] @ weights - centred[k]).norm())
+        errors.append(float(torch.stack(left).mean()))
+    assert told == pytest.approx(min(errors), rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_the_least_deviation_is_that_of_errors_and_prior_together(count):
+    """One number, errors along a line: against all numbers of a fine grid."""
+    generator = torch.Generator().manual_seed(0)
+    slope, offset = torch.randn(2, count, 3, generator=generator, dtype=F)
+    expected, spread, noise, floor = torch.tensor([0.5], dtype=F), torch.tensor([0.2], dtype=F), 0.8, 0.1
+    found = least_deviation(
+        lambda x: (slope * x - offset, slope[..., None]), torch.zeros(1, dtype=F), floor=floor, expected=expected,
+        spread=spread, noise=noise, iterations=60,
+    )  # fmt: skip
+    *_, (best, loss) = found
+
+    def objective(x):
+        size = ((slope * x - offset).square().sum(-1) + floor**2).sqrt().mean()
+        return float(size + noise / (2 * count) * ((x - expected) / spread).square().sum())
+
+    grid = torch.linspace(-2.0, 2.0, 4001, dtype=F)
+    assert loss == pytest.approx(objective(best))
+    assert objective(best) == pytest.approx(min(map(objective, grid)), rel=2e-4)
+
+
+@pytest.mark.parametrize("terms", [INSIDE, BESIDE], ids=["inside", "beside"])
+def test_a_process_has_the_posterior_of_its_gaussian_and_learns_uphill(data, terms):
+    """Against the dense covariance of latents and end poses, assembled entry by entry."""
+    thing_ = PushedObject(data.vertices, data.com, data.mass)
+    seen, other = (features(data.pushes.take(torch.arange(*rows)), thing_) for rows in ((0, 10), (10, 14)))
+    generator = torch.Generator().manual_seed(0)
+    through, left = (
+        torch.randn(10, 3, 11, generator=generator, dtype=F),
+        torch.randn(10, 3, generator=generator, dtype=F),
+    )
+    through[..., 8:] = torch.eye(3, dtype=F)
+    process = Process(terms, 10, 15)
+    likelihood = [figures["log_likelihood"] for figures in process.fit(seen, through, left)]
+    assert likelihood[-1] > likelihood[0] + 0.1
+    between, across = (process.functions(each, seen, process.log_scales) for each in (seen, other))
+    covariance = (2.0 * process.log_scales[-1]).exp() * torch.eye(30, dtype=F)
+    crossed = torch.zeros(4, 11, 30, dtype=F)
+    for name in terms:
+        for latent in range(11)[LATENTS[name][0]]:
+            rows = through[:, :, latent]
+            covariance += torch.einsum("ia,ij,jb->iajb", rows, between[name], rows).reshape(30, 30)
+            crossed[:, latent] += torch.einsum("ij,jb->ijb", across[name], rows).reshape(4, 30)
+    posterior = crossed @ torch.linalg.solve(covariance, left.reshape(-1))
+    torch.testing.assert_close(process.mean(other, seen), posterior, rtol=0, atol=1e-6)  # weights are float32

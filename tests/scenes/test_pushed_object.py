@@ -289,3 +289,18 @@ def test_what_makes_no_sense_is_refused_by_name(bad):
     # a wrong literal is a TypeError first where the tests check types
     with pytest.raises((ValueError, TypeError), match=next(iter(bad))):
         PushedObject(**({"vertices": SQUARE, "com": CENTRE, "mass": 1.0} | bad))
+
+
+def test_the_first_touch_is_the_first_point_of_the_way_that_is_not_outside():
+    """Ways in all directions, some past a corner, some too short, some that start inside: against 20,000 points."""
+    generator = torch.Generator().manual_seed(0)
+    start, end = (0.3 * torch.rand(400, 2, generator=generator, dtype=F) - 0.1 for _ in range(2))
+    pose = torch.cat((torch.zeros(400, 2, dtype=F), 6.28 * torch.rand(400, 1, generator=generator, dtype=F)), -1)
+    push = Push(pose, rotate(pose[:, 2], start), rotate(pose[:, 2], end))
+    ways = torch.linspace(0.0, 1.0, 20_001, dtype=F)
+    points = start[:, None] + ways[:, None] * (end - start)[:, None]
+    inside = (points[..., 0] >= 0) & (points[..., 1] >= 0) & (points.sum(-1) <= 0.15)
+    first = torch.where(inside.any(1), ways[inside.int().argmax(1)], 1.0)
+    assert min(inside.any(1).sum(), (~inside.any(1)).sum()) > 100
+    off = (triangle().first_touch(push) - first).abs()
+    assert off.max() <= 1e-4

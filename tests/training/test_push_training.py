@@ -1,6 +1,8 @@
 """A training of a model of pushes: what judges it, and what it leaves."""
 
+import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +68,26 @@ def test_a_push_whose_prediction_is_not_finite_has_infinite_errors_and_is_said_a
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["deviation_mm"] == "diverged"
     assert "nan" not in result.report
     assert len(list((tmp_path / "run").glob("*.png"))) == 2
+
+
+def test_errors_are_those_that_were_put_in(data: PushData) -> None:
+    """3 mm beside, 4 mm of a turn about the centre of mass; a force of half the size, turned by a right angle."""
+    model = Ridge(**thing(data))
+    motion = model.motion(data.pushes, data.outcome.pose) + torch.tensor((0.003, 0.0, 0.004), dtype=torch.float64)
+    force = 0.5 * data.outcome.force.flip(-1) * torch.tensor((-1.0, 1.0), dtype=torch.float64)
+    solved = torch.ones(12, dtype=torch.bool)
+    found = errors(model, data, PushPrediction(model.pose(data.pushes, motion), force, solved)).figures()
+    size = float(data.outcome.force.norm(dim=-1).mean())
+    wanted = {"deviation_mm": 5.0, "position_mm": 3.0, "rotation_deg": math.degrees(0.004 / 0.05)}
+    wanted |= {"force_direction_deg": 90.0, "force_size_n": size / 2}
+    assert {name: found[name] for name in wanted} == pytest.approx(wanted)
+    still = errors(model, data, PushPrediction(data.pushes.push.pose, 0.0 * force, solved)).figures()
+    assert (still["twist_angle_deg"], still["force_direction_deg"]) == (90.0, 90.0)  # no direction is no hit
+    nothing = data.outcome._replace(force=data.outcome.force * torch.nan)
+    unknown = errors(
+        model, dataclasses.replace(data, outcome=nothing), PushPrediction(data.outcome.pose, force, solved)
+    )
+    assert not any(name.startswith("force") for name in unknown.values)
 
 
 def test_pictures_of_pushes_have_one_frame_for_each_configuration(data: PushData) -> None:

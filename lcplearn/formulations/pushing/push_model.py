@@ -61,7 +61,8 @@ class PushModel(nn.Module):
     def motion(self, pushes: Pushes, pose: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
         """Displacement of the centre of mass and RADIUS times the turn, in the object's axes at the start [m]."""
         start = pushes.push.pose
-        shift = pose[:, :2] + rotate(pose[:, 2], self.com) - start[:, :2] - rotate(start[:, 2], self.com)
+        # Differences first: what does not move has a motion of exactly 0.
+        shift = pose[:, :2] - start[:, :2] + (rotate(pose[:, 2], self.com) - rotate(start[:, 2], self.com))
         turn = torch.remainder(pose[:, 2] - start[:, 2] + math.pi, 2.0 * math.pi) - math.pi
         return torch.cat((rotate(-start[:, 2], shift), RADIUS * turn[:, None]), -1)
 
