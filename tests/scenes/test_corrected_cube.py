@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from lcplearn.scenes.corrected_cube import SHAPES, CorrectedCube
+from lcplearn.scenes.corrected_cube import REACH, SHAPES, CorrectedCube
 from lcplearn.scenes.scene import Drive, rollout
-from lcplearn.scenes.space import POSE, quaternion_product
+from lcplearn.scenes.space import POSE, quaternion_product, rotation_matrix
+from lcplearn.scenes.spatial_body import box_corners
 from lcplearn.scenes.tossed_cube import IMPACT_SPEED, TossedCube
 
 H, M, DT, STEPS = 0.05, 0.4, 1 / 148, 40
@@ -121,6 +122,30 @@ def test_at_rest_on_the_ground_no_force_is_felt():
     still[2] = H
     path = rollout(cube("force"), still.expand(1, 13), forces(1, 50))
     assert torch.equal(path.states[:, 1:, 7:], torch.zeros(1, 50, 6, dtype=torch.float64))
+
+
+def test_a_corner_near_the_ground_is_pushed_along_the_normal_and_its_slip():
+    """Above it nothing touches: the step is that of Newton and Euler under one force at one corner."""
+    scene = cube("force", radius=0.0)
+    state = start(1)[0]
+    turn = rotation_matrix(state[3:7])
+    levers = box_corners(torch.full((3,), H, dtype=torch.float64)) @ turn.mT
+    lever = levers[levers[:, 2].argmin()]
+    state[2] = 0.06 * H - lever[2]
+    state[7:10] = torch.tensor([0.3, -0.2, 0.0])
+    state[10:] = turn.mT @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    moves = state[7:10] + torch.linalg.cross(turn @ state[10:], lever)
+    slip, speed = moves[:2], IMPACT_SPEED * H
+    x = torch.tensor([0.06 / REACH, 0.0, slip.norm() / speed], dtype=torch.float64)
+    weights, bias = scene.hidden[:, :-1], scene.hidden[:, -1]
+    up, drag = scene.outer @ (torch.tanh(weights @ x + bias) - torch.tanh(bias))
+    along = -drag * slip / (speed**2 + slip @ slip).sqrt()
+    force = (1.0 - 0.06 / REACH) * M * 9.81 * torch.cat((along, up[None]))
+    after = scene.advance(state, Drive(torch.zeros(6, dtype=torch.float64))).state
+    gravity = torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
+    torch.testing.assert_close(after[7:10] - state[7:10], DT * (force / M + gravity))
+    spun = turn.mT @ torch.linalg.cross(lever, force) / (0.8 * M * H**2)
+    torch.testing.assert_close(after[10:] - state[10:], DT * spun)
 
 
 def test_a_law_scales_friction_and_shifts_the_logit_of_restitution():
