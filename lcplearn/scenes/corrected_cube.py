@@ -32,13 +32,13 @@ class CorrectedCube(TossedCube):
 
     - friction: mu and mu_impact times exp(net(c / s)), with c the closing speed of the fastest corner that lands;
     - restitution e: the logit of e plus net(c / s);
-    - force: on each corner that would end a step at a height phi below `REACH`, m g net_1 upwards and
-      m g net_2 slip / sqrt(s^2 + slip^2) against its slip, both times 1 - phi / reach (at most 1);
-      x = (phi / reach, v_n / s, |slip| / s).
+    - force: a drag on each corner that would end a step at a height phi below `REACH`, m g net_1 along the normal and
+      m g net_2 along its slip, each times v / sqrt(s^2 + v^2) of its velocity v there and 1 - phi / reach (at most 1);
+      x = (phi / reach, v_n / s, |slip| / s). It may be negative, and then drives.
 
-    The outputs know neither the direction of a slip nor which corner it is: what follows turns with the body about the
-    vertical, and with the names of its corners. A body at rest on the ground feels no force from it. With outer = 0 it
-    is the `TossedCube`, to the last bit.
+    The network knows neither the direction of a slip nor which corner it is: what follows turns with the body about the
+    vertical, and with the names of its corners. What does not move feels no force from it. With outer = 0 it is the
+    `TossedCube`, to the last bit.
 
     Attributes:
         corrects: What the network corrects: friction, restitution or force.
@@ -100,8 +100,9 @@ class CorrectedCube(TossedCube):
         slip = matvec(touch.tangents, velocity.unsqueeze(-2))
         inputs = (height / reach, approach / speed, torch.linalg.vector_norm(slip, dim=-1) / speed)
         near = (1.0 - height / reach).clamp(0.0, 1.0) * self.mass * self.gravity
-        up, drag = (near.unsqueeze(-1) * self._network(torch.stack(inputs, dim=-1))).unbind(-1)
-        along = -drag.unsqueeze(-1) * slip / (speed**2 + slip.square().sum(-1, keepdim=True)).sqrt()
+        drag = -near.unsqueeze(-1) * self._network(torch.stack(inputs, dim=-1))
+        up = drag[..., 0] * approach / (speed**2 + approach**2).sqrt()
+        along = drag[..., 1:] * slip / (speed**2 + slip.square().sum(-1, keepdim=True)).sqrt()
         return matvec(touch.normal.mT, up) + matvec(touch.tangents.flatten(-3, -2).mT, along.flatten(-2))
 
     def _network(self, x: Float[Tensor, "*#batch K inputs"]) -> Float[Tensor, "... K outputs"]:

@@ -124,22 +124,23 @@ def test_at_rest_on_the_ground_no_force_is_felt():
     assert torch.equal(path.states[:, 1:, 7:], torch.zeros(1, 50, 6, dtype=torch.float64))
 
 
-def test_a_corner_near_the_ground_is_pushed_along_the_normal_and_its_slip():
+def test_a_corner_near_the_ground_is_held_up_against_its_velocity():
     """Above it nothing touches: the step is that of Newton and Euler under one force at one corner."""
     scene = cube("force", radius=0.0)
     state = start(1)[0]
     turn = rotation_matrix(state[3:7])
     levers = box_corners(torch.full((3,), H, dtype=torch.float64)) @ turn.mT
     lever = levers[levers[:, 2].argmin()]
-    state[2] = 0.06 * H - lever[2]
-    state[7:10] = torch.tensor([0.3, -0.2, 0.0])
+    state[7:10] = torch.tensor([0.3, -0.2, -0.1])
     state[10:] = turn.mT @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    state[2] = 0.06 * H + 0.1 * DT - lever[2]  # where it would end: 0.06 half widths
     moves = state[7:10] + torch.linalg.cross(turn @ state[10:], lever)
     slip, speed = moves[:2], IMPACT_SPEED * H
-    x = torch.tensor([0.06 / REACH, 0.0, slip.norm() / speed], dtype=torch.float64)
-    weights, bias = scene.hidden[:, :-1], scene.hidden[:, -1]
-    up, drag = scene.outer @ (torch.tanh(weights @ x + bias) - torch.tanh(bias))
-    along = -drag * slip / (speed**2 + slip @ slip).sqrt()
+    x = torch.tensor([0.06 / REACH, -0.1 / speed, slip.norm() / speed], dtype=torch.float64)
+    hidden, bias = scene.hidden[:, :-1], scene.hidden[:, -1]
+    normal, tangential = scene.outer @ (torch.tanh(hidden @ x + bias) - torch.tanh(bias))
+    along = -tangential * slip / (speed**2 + slip @ slip).sqrt()
+    up = normal * 0.1 / (speed**2 + 0.01) ** 0.5
     force = (1.0 - 0.06 / REACH) * M * 9.81 * torch.cat((along, up[None]))
     after = scene.advance(state, Drive(torch.zeros(6, dtype=torch.float64))).state
     gravity = torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
