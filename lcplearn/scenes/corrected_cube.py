@@ -16,12 +16,8 @@ from lcplearn.scenes.scene import Drive, Step, Trajectory
 from lcplearn.scenes.space import POSE
 from lcplearn.scenes.tossed_cube import IMPACT_SPEED, TossedCube
 
-REACH = 0.1  # [half widths] corners that would end a step below this height are pushed
-SHAPES = {
-    "friction": (1, 1),
-    "restitution": (1, 1),
-    "force": (3, 2),
-}  # what is corrected: inputs, outputs of the network
+REACH = 0.1  # [half widths] corners that would end a step below this height feel the force
+SHAPES = {"friction": (1, 1), "restitution": (1, 1), "force": (3, 2)}  # inputs and outputs of the network
 
 
 @dataclass(frozen=True)
@@ -85,7 +81,13 @@ class CorrectedCube(TossedCube):
         return TossedCube.substep(replace(self, **corrected), state, drive)
 
     def law(self, closing: Float[Tensor, "*#batch"]) -> dict[str, Tensor]:
-        """mu and mu_impact, or restitution, corrected for a closing speed [m/s]."""
+        """mu and mu_impact, or restitution, corrected for a closing speed [m/s].
+
+        Raises:
+            ValueError: It is a force that is corrected.
+        """
+        if self.corrects == "force":
+            raise ValueError("corrects: expected friction or restitution for a law, got force")
         share = closing / (IMPACT_SPEED * self.half_width)
         change = self._network(share[..., None, None])[..., 0, 0]
         if self.corrects == "restitution":

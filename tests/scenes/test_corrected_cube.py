@@ -176,3 +176,8 @@ def test_a_law_scales_friction_and_shifts_the_logit_of_restitution():
 def test_a_wrong_argument_is_named(change: dict[str, Any], message: str):
     with pytest.raises(ValueError, match=message):
         cube("friction", **change)
+
+
+def test_a_force_has_no_law_of_a_closing_speed():
+    with pytest.raises(ValueError, match=r"^corrects: expected friction or restitution"):
+        cube("force").law(torch.ones(3, dtype=torch.float64))
