@@ -39,7 +39,10 @@ def explain(message: str, conf: Path, own: Iterable[Path] = ()) -> str:
         if not group:
             return unknown(key, conf)
         if key in in_files:
-            return f"'{named[1]}' is a setting of another {group}= than the chosen one."
+            return (
+                f"'{named[1]}' is set in the file of another {group}= than the chosen one; "
+                f"if the chosen one takes it, too, write +{named[1]}=..."
+            )
         theirs = {name for folder in own for names in vocabulary(folder, group) for name in names}
         return f"Unknown setting '{named[1]}'; {suggestion(key, in_files | in_code | theirs, f'{group}.')}"
     several = re.search(r"Ambiguous value for argument '([^']+)'", message)

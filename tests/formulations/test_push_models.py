@@ -95,6 +95,19 @@ def test_the_residual_learns_what_the_mechanics_miss(data, known):
     assert after < 0.5 * before
 
 
+def test_the_residual_is_the_mean_of_what_is_learned_inside_and_beside_the_rollout(data, fitted):
+    def motion(*silent):
+        model = copy.deepcopy(fitted[Residual])
+        for name in silent:
+            getattr(model, name).weights.zero_()
+        with torch.no_grad():
+            return model.motion(data.pushes, model.predict(data.pushes).pose)
+
+    both, inside, beside, neither = motion(), motion("beside"), motion("inside"), motion("inside", "beside")
+    torch.testing.assert_close(both - neither, (inside - neither) + (beside - neither), rtol=0, atol=1e-12)
+    assert min(float((part - neither).abs().max()) for part in (inside, beside)) > 1e-6
+
+
 @pytest.mark.parametrize("kind", [Supports, Residual, Ridge, PushMLP])
 def test_a_model_from_its_state_predicts_the_same(data, fitted, kind):
     model = fitted[kind]

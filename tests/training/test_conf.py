@@ -216,7 +216,11 @@ def test_processes_of_torchrun_that_would_write_two_runs_are_refused(arguments: 
     [
         ("modle=relu", "Unknown setting 'modle'; did you mean 'model'?"),
         ("noise=1", "Unknown setting 'noise'; did you mean 'data.noise' or 'model.noise'?"),
-        ("data.path=x", "'data.path' is a setting of another data= than the chosen one."),
+        (
+            "data.path=x",
+            "'data.path' is set in the file of another data= than the chosen one; "
+            "if the chosen one takes it, too, write +data.path=...",
+        ),
         (
             "model=affine,mlp",
             "model=affine,mlp are several values: -m before the settings trains one run after the other.",
