@@ -4,7 +4,6 @@ States, loads and friction forces are kept; all else of a step is computed anew.
 respect to x.
 """
 
-from math import cos, sin, sqrt
 from typing import Any
 
 from lcplearn.lcp.kernel.memory import address as data_address
@@ -19,88 +18,8 @@ from lcplearn.scenes.contact_kernel.memory import (
     loaded_memory,
     row,
 )
-from lcplearn.scenes.spatial_kernel import SMALL, approach, jacobian, rotation
-
-
-@compiled
-def _turn_back(x, after, v, dt, after_, v_, x_):
-    """Backwards through q' = q exp(dt w) / |q|: adds to v_ [6] and writes x_[3:7]."""
-    a, b, c = dt * v[3], dt * v[4], dt * v[5]
-    square = (a * a + b * b + c * c) / 4.0
-    if square < SMALL:
-        cosine, sinc, slope = 1.0 - square / 2.0, 1.0 - square / 6.0, -1.0 / 6.0 + square / 60.0
-    else:
-        half = sqrt(square)
-        cosine, sinc = cos(half), sin(half) / half
-        slope = (cosine - sinc) / (2.0 * square)
-    a, b, c = sinc * a / 2.0, sinc * b / 2.0, sinc * c / 2.0
-    w0, x0, y0, z0 = x[3], x[4], x[5], x[6]
-    norm, along = sqrt(w0 * w0 + x0 * x0 + y0 * y0 + z0 * z0), 0.0
-    for i in range(4):
-        along += after[3 + i] * after_[3 + i]
-    u0, u1, u2, u3 = (
-        (after_[3] - after[3] * along) / norm, (after_[4] - after[4] * along) / norm,
-        (after_[5] - after[5] * along) / norm, (after_[6] - after[6] * along) / norm,
-    )  # fmt: skip
-    x_[3] = u0 * cosine + u1 * a + u2 * b + u3 * c
-    x_[4] = -u0 * a + u1 * cosine - u2 * c + u3 * b
-    x_[5] = -u0 * b + u1 * c + u2 * cosine - u3 * a
-    x_[6] = -u0 * c - u1 * b + u2 * a + u3 * cosine
-    e0 = w0 * u0 + x0 * u1 + y0 * u2 + z0 * u3
-    e1 = -x0 * u0 + w0 * u1 + z0 * u2 - y0 * u3
-    e2 = -y0 * u0 - z0 * u1 + w0 * u2 + x0 * u3
-    e3 = -z0 * u0 + y0 * u1 - x0 * u2 + w0 * u3
-    turning = dt * (v[3] * e1 + v[4] * e2 + v[5] * e3)
-    radial = (-sinc * e0 + slope * turning) / 4.0
-    v_[3] += dt * (sinc * e1 / 2.0 + radial * dt * v[3])
-    v_[4] += dt * (sinc * e2 / 2.0 + radial * dt * v[4])
-    v_[5] += dt * (sinc * e3 / 2.0 + radial * dt * v[5])
-
-
-@compiled
-def _rotation_back(x, R_, x_):
-    """Backwards through the rotation matrix; adds to x_[3:7]."""
-    w, x0, y, z = x[3], x[4], x[5], x[6]
-    x_[3] += 2.0 * (
-        z * (R_[1, 0] - R_[0, 1]) + y * (R_[0, 2] - R_[2, 0]) + x0 * (R_[2, 1] - R_[1, 2])
-    )  # fmt: skip
-    x_[4] += 2.0 * (
-        y * (R_[0, 1] + R_[1, 0]) + z * (R_[0, 2] + R_[2, 0]) + w * (R_[2, 1] - R_[1, 2])
-        - 2.0 * x0 * (R_[1, 1] + R_[2, 2])
-    )  # fmt: skip
-    x_[5] += 2.0 * (
-        x0 * (R_[0, 1] + R_[1, 0]) + z * (R_[1, 2] + R_[2, 1]) + w * (R_[0, 2] - R_[2, 0])
-        - 2.0 * y * (R_[0, 0] + R_[2, 2])
-    )  # fmt: skip
-    x_[6] += 2.0 * (
-        x0 * (R_[0, 2] + R_[2, 0]) + y * (R_[1, 2] + R_[2, 1]) + w * (R_[1, 0] - R_[0, 1])
-        - 2.0 * z * (R_[0, 0] + R_[1, 1])
-    )  # fmt: skip
-
-
-@compiled
-def _spin_back(spin, free_spin, inertia, dt, torque, free_, x_, inertia_):
-    """Backwards through the implicit midpoint step: writes x_[10:13], adds to inertia_."""
-    h = dt / 2.0
-    m0, m1, m2 = (
-        (spin[0] + free_spin[0] - dt * torque[0] / inertia[0]) / 2.0,
-        (spin[1] + free_spin[1] - dt * torque[1] / inertia[1]) / 2.0,
-        (spin[2] + free_spin[2] - dt * torque[2] / inertia[2]) / 2.0,
-    )
-    i0, i1, i2 = inertia[0], inertia[1], inertia[2]
-    # the transposed matrix of the residual's derivative
-    a, d, g = i0, h * (i2 - i1) * m2, h * (i2 - i1) * m1
-    b, e, k = h * (i0 - i2) * m2, i1, h * (i0 - i2) * m0
-    c, f, m = h * (i1 - i0) * m1, h * (i1 - i0) * m0, i2
-    e0, e1, e2 = 2.0 * free_[3], 2.0 * free_[4], 2.0 * free_[5]
-    determinant = a * (e * m - f * k) - b * (d * m - f * g) + c * (d * k - e * g)
-    s0 = (e0 * (e * m - f * k) - b * (e1 * m - f * e2) + c * (e1 * k - e * e2)) / determinant
-    s1 = (a * (e1 * m - f * e2) - e0 * (d * m - f * g) + c * (d * e2 - e1 * g)) / determinant
-    s2 = (a * (e * e2 - e1 * k) - b * (d * e2 - e1 * g) + e0 * (d * k - e * g)) / determinant
-    x_[10], x_[11], x_[12] = i0 * s0 - free_[3], i1 * s1 - free_[4], i2 * s2 - free_[5]
-    inertia_[0] -= s0 * (m0 - spin[0]) + h * m0 * (s1 * m2 - s2 * m1)
-    inertia_[1] -= s1 * (m1 - spin[1]) + h * m1 * (s2 * m0 - s0 * m2)
-    inertia_[2] -= s2 * (m2 - spin[2]) + h * m2 * (s0 * m1 - s1 * m0)
+from lcplearn.scenes.spatial_kernel import approach, jacobian
+from lcplearn.scenes.spatial_turning import rotation, rotation_back, spin_back, turn_back
 
 
 @compiled
@@ -204,7 +123,7 @@ def _free_back(x, free, gyroscopic, mass, dt, force, free_, x_, force_, mass_, g
         x_[7 + k] += free_[k]
     if gyroscopic:
         before = (x_[10], x_[11], x_[12])
-        _spin_back(x[10:13], free[3:], mass[3:], dt, force[3:], free_, x_, mass_[3:])
+        spin_back(x[10:13], free[3:], mass[3:], dt, force[3:], free_, x_, mass_[3:])
         for k in range(3):
             x_[10 + k] += before[k]
     else:
@@ -232,7 +151,7 @@ def _step_back(
     for k in range(3):
         x_[k] = after_[k]
         v_[k] += dt * after_[k]
-    _turn_back(x, after, after[7:], dt, after_, v_, x_)
+    turn_back(x, after, after[7:], dt, after_, v_, x_)
     for i in range(C):
         if load[i] > 0.0:
             for d in range(2):
@@ -251,7 +170,7 @@ def _step_back(
             x_,
         )  # fmt: skip
     _free_back(x, free, gyroscopic, mass, dt, force, free_, x_, force_, mass_, gravity_)
-    _rotation_back(x, R_, x_)
+    rotation_back(x, R_, x_)
     for k in range(13):
         out[k] += x_[k]
     return known
@@ -270,7 +189,7 @@ def _again(t, x, F):
 
 def _make_roll_back(sources: str) -> Any:
     def _roll_back(
-        scratch, dt, newton, gyroscopic, rest, impact_speed, force, corners, mass, numbers, gravity, states, modes,
+        dt, newton, gyroscopic, rest, impact_speed, scratch, force, corners, mass, numbers, gravity, states, modes,
         solved, loads, frictions, sticking, states_, force_, corners_, mass_, numbers_, gravity_,
     ):  # fmt: skip
         """Gradients from that of the states; that of the start replaces states_[:, 0].
@@ -298,7 +217,9 @@ def _make_roll_back(sources: str) -> Any:
     return compiled(_roll_back, cached=True)
 
 
-roll_back = _make_roll_back(fingerprint("contact_gradient.py", "spatial_kernel.py", "spatial_adjoint.py"))
+roll_back = _make_roll_back(
+    fingerprint("contact_gradient.py", "spatial_kernel.py", "spatial_adjoint.py", "spatial_turning.py")
+)
 
 
 def back_scratch(C: int) -> int:

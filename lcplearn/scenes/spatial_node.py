@@ -1,13 +1,17 @@
 """Rollouts of bodies in space on the CPU as one node of autograd."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lcplearn.scenes.contact_kernel.compiling import refuse_batched
+from lcplearn.scenes.contact_kernel.slices import by_slices
+from lcplearn.scenes.contact_kernel.steps import SECONDS
 from lcplearn.scenes.spatial_adjoint import back_scratch, roll_back
 from lcplearn.scenes.spatial_kernel import Options, Rolled, roll
 
@@ -17,8 +21,12 @@ def roll_out(options: Options, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     if torch.is_grad_enabled() and any(x.requires_grad for x in given):
         found: tuple[Tensor, Tensor, Tensor] = _Rollout.apply(options, *given)
         return found
-    states, modes, solved = (torch.from_numpy(x) for x in roll(given, options)[:3])
+    states, modes, solved = (torch.from_numpy(x) for x in roll(_arrays(given), options)[:3])
     return states, modes, solved
+
+
+def _arrays(given: Sequence[Tensor]) -> list[NDArray]:
+    return [x.detach().contiguous().numpy() for x in given]
 
 
 class _Rollout(torch.autograd.Function):
@@ -26,10 +34,10 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, options: Options, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rolled = tuple(torch.from_numpy(x) for x in roll(given, options, keep=True))
-        ctx.options = options
-        ctx.save_for_backward(*given, *rolled)
-        states, modes, solved = rolled[:3]
+        ctx.given, ctx.options = _arrays(given), options
+        ctx.rolled = roll(ctx.given, options, keep=True)
+        states, modes, solved = (torch.from_numpy(x) for x in ctx.rolled[:3])
+        ctx.save_for_backward(*given, states, modes, solved)
         ctx.mark_non_differentiable(modes, solved)
         return states, modes, solved
 
@@ -37,15 +45,15 @@ class _Rollout(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         refuse_batched((gradient,))
-        given, rolled = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
-        return (None, *pull_back(given, ctx.options, Rolled(*(x.detach().numpy() for x in rolled)), gradient))
+        _ = ctx.saved_tensors  # raises where one was changed in place; the arrays are their memory
+        return (None, *pull_back(ctx.given, ctx.options, ctx.rolled, gradient))
 
 
-def pull_back(given: Sequence[Tensor], options: Options, rolled: Rolled, gradient: Tensor) -> list[Tensor]:
+def pull_back(given: Sequence[NDArray], options: Options, rolled: Rolled, gradient: Tensor) -> list[Tensor]:
     """Gradients with respect to what `roll` was given, from that with respect to the states."""
-    states_ = gradient.detach().clone(memory_format=torch.contiguous_format)
-    results = [torch.zeros_like(x, memory_format=torch.contiguous_format) for x in given[1:]]
-    values = [x.detach().contiguous().numpy() for x in given[1:]]
-    scratch = np.empty(back_scratch(given[2].shape[1]))
-    roll_back(scratch, *options, *values, *rolled, states_.numpy(), *(x.numpy() for x in results))
-    return [states_[:, 0], *results]
+    states_ = gradient.numpy().copy(order="C")
+    results = [np.zeros(x.shape) for x in given[1:]]
+    B, T, C = rolled.loads.shape
+    arrays = (*given[1:], *rolled, states_, *results)
+    by_slices(partial(roll_back, *options), arrays, B, T * SECONDS * C, back_scratch(C))
+    return [torch.from_numpy(x) for x in (states_[:, 0], *results)]

@@ -1,7 +1,7 @@
 """A batch of contact problems, compiled: their solution and its gradient as one node of autograd."""
 
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Iterable, Sequence
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +16,11 @@ from lcplearn.scenes.contact_kernel.adjoint import UNKNOWN, pull_back_contacts
 from lcplearn.scenes.contact_kernel.compiling import compiled, fingerprint, refuse_batched
 from lcplearn.scenes.contact_kernel.element import solve_element
 from lcplearn.scenes.contact_kernel.memory import adjoint_scratch, bare, bare_flags, contact_scratch, loaded_memory
+from lcplearn.scenes.contact_kernel.slices import by_slices
 from lcplearn.scenes.friction_lcp import Problem
 
 STICK, SLIP, SEPARATION = 0, 1, 2  # scene.Mode, as plain constants
+SECONDS = 3e-7  # of a step, for each contact that may close: to decide on threads
 
 
 def _make_solve_all(sources: str) -> Any:
@@ -126,41 +128,51 @@ def solve(problem: Problem, rest: bool) -> ContactStep:
     if torch.is_grad_enabled() and any(x.requires_grad for x in problem):
         velocity, load, friction, modes, _, flags = _Contacts.apply(rest, *problem)
     else:
-        velocity, load, friction, modes, _, flags = map(torch.from_numpy, _solve(problem, rest))
+        velocity, load, friction, modes, _, flags = map(torch.from_numpy, _solve(_arrays(problem), rest))
     solved, settled, at_rest = flags.unbind(-1)
     return ContactStep(velocity, load, friction, modes, at_rest, solved, settled)
 
 
-def _solve(problem: Iterable[Tensor], rest: bool) -> Solved:
-    arrays = [x.detach().contiguous().numpy() for x in problem]
-    target, _, tangents, *_, free, _ = arrays
+def _arrays(problem: Iterable[Tensor]) -> list[np.ndarray]:
+    return [x.detach().contiguous().numpy() for x in problem]
+
+
+def _solve(problem: Sequence[np.ndarray], rest: bool) -> Solved:
+    target, _, tangents, *_, free, _ = problem
     found = Solved(
         np.empty_like(free), np.empty_like(target), np.empty(tangents.shape[:3]), np.empty(target.shape, np.int64),
         np.empty(target.shape, np.bool_), np.empty((len(free), 3), np.bool_),
     )  # fmt: skip
-    scratch = np.empty(contact_scratch(tangents.shape[1], tangents.shape[3]))
-    _solve_all(solver_address(), rest, scratch, *arrays, *found)
+    _, C, _, nv = tangents.shape
+    run, seconds = partial(_solve_all, solver_address(), rest), SECONDS * C
+    by_slices(run, (*problem, *found), len(free), seconds, contact_scratch(C, nv))
     return found
 
 
 class _Contacts(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rest: bool, *problem: Tensor) -> tuple[Tensor, ...]:
-        velocity, load, friction, *told = map(torch.from_numpy, _solve(problem, rest))
+        ctx.given = _arrays(problem)
+        ctx.found = _solve(ctx.given, rest)
+        velocity, load, friction, *told = map(torch.from_numpy, ctx.found)
         ctx.save_for_backward(*problem, load, friction, *told[1:])
         ctx.mark_non_differentiable(*told)
+        ctx.set_materialize_grads(False)
         return velocity, load, friction, *told
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        refuse_batched(gradients[:3])
-        saved = [x.detach().contiguous().numpy() for x in ctx.saved_tensors]
-        given, found = saved[: len(Problem._fields)], saved[len(Problem._fields) :]
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        refuse_batched(x for x in gradients[:3] if x is not None)
+        _ = ctx.saved_tensors  # raises where one was changed in place; the arrays are their memory
+        given, (*known, _, sticks, flags) = ctx.given, ctx.found
+        wanted = [
+            np.zeros(x.shape) if g is None else g.contiguous().numpy()
+            for g, x in zip(gradients[:3], known, strict=True)
+        ]
         results = [np.zeros(x.shape) for x in given]
-        wanted = [x.contiguous().numpy() for x in gradients[:3]]
         _, C, T, nv = given[2].shape
-        scratch = np.empty(adjoint_scratch(C, nv, T))
-        _pull_back_all(scratch, *given[1:], *found, *wanted, *results)
+        arrays, scratch = (*given[1:], *known[1:], sticks, flags, *wanted, *results), adjoint_scratch(C, nv, T)
+        by_slices(_pull_back_all, arrays, len(given[0]), SECONDS * C, scratch)
         wants = ctx.needs_input_grad[1:]
         return (None, *(torch.from_numpy(x) if want else None for x, want in zip(results, wants, strict=True)))
