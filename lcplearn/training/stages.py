@@ -46,11 +46,13 @@ def plan(
         lr: Learning rate of the last stage.
 
     Raises:
-        ValueError: No epoch, a stage lacks its epochs or leaves none to the last stage, its horizon is out of range, or
-            its learning rate is no positive number.
+        ValueError: No epoch or no step, a stage lacks its epochs or leaves none to the last stage, its horizon is out
+            of range, or its learning rate is no positive number.
     """
     if epochs < 1:
         raise ValueError(f"epochs: expected at least 1, got {epochs}")
+    if horizon < 1:
+        raise ValueError(f"horizon: expected at least 1 step, got {horizon}")
     if not isinstance(before, Sequence) or not all(isinstance(stage, Mapping) for stage in before):
         raise ValueError(f"stages: expected a list of {{epochs: .., what differs}}, got {before!r}")
     stages: list[Stage] = []

@@ -25,7 +25,7 @@ def arguments(given: Mapping[str, Any] | None, epochs: int) -> dict[str, Any]:
     """Keyword arguments of the Trainer: the defaults of this project, and what is given.
 
     Raises:
-        ValueError: a number of epochs, another precision than float64, or a GPU that isn't there.
+        ValueError: a number of epochs, another precision than float64, a GPU that isn't there, or no validations.
     """
     if "max_epochs" in (given or {}):
         raise ValueError("trainer: expected the number of epochs as epochs=, by which stages and rates are planned")
@@ -44,7 +44,10 @@ def arguments(given: Mapping[str, Any] | None, epochs: int) -> dict[str, Any]:
         )
     if chosen["accelerator"] in ("cuda", "gpu") and not torch.cuda.is_available():
         raise ValueError("torch finds no CUDA device here: use trainer=cpu (trainer={'accelerator': 'cpu'}).")
-    chosen["check_val_every_n_epoch"] = min(chosen["check_val_every_n_epoch"], epochs)
+    every = chosen["check_val_every_n_epoch"]
+    if not isinstance(every, int) or every < 1:
+        raise ValueError(f"trainer: expected check_val_every_n_epoch of at least 1, got {every!r}")
+    chosen["check_val_every_n_epoch"] = min(every, epochs)
     return chosen
 
 

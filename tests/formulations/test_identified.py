@@ -109,6 +109,16 @@ def test_a_pulled_spring_holds_still_within_friction_and_swings_about_its_true_f
     assert crossings.tolist() == pytest.approx([0.25, 0.75], abs=2e-3)
 
 
+def test_a_spring_pulls_where_the_block_is_after_the_step() -> None:
+    """v' = (v + dt (u - k x) / m) / (1 + k dt^2 / m) without friction: however stiff, it does not gain."""
+    state, force = torch.tensor([0.3, -1.0], dtype=torch.float64), torch.tensor([2.0], dtype=torch.float64)
+    block = SpringBlock(mass=1.5, mu=0.0, stiffness=1e5, dt=0.1)
+    after = block.step(state, force)[1]
+    assert float(after) == pytest.approx((-1.0 + 0.1 * (2.0 - 1e5 * 0.3) / 1.5) / (1.0 + 1e5 * 0.1**2 / 1.5))
+    path = block.rollout(state, torch.zeros(50, 1, dtype=torch.float64))
+    assert path.positions[1:].abs().max() < 0.3
+
+
 def test_numbers_stay_in_the_domain_that_the_scene_declares() -> None:
     model = Identified(scene=BouncingBlock, dt=0.1, learn={"mass": 2.0, "restitution": 0.5, "gravity": 9.81})
     assert model.physical_parameters() == pytest.approx({"mass": 2.0, "restitution": 0.5, "gravity": 9.81})

@@ -123,6 +123,26 @@ def test_a_model_of_another_time_step_or_gravity_than_the_data_is_refused(tmp_pa
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"horizon": 0}, "^horizon: expected at least 1 step, got 0"),
+        (
+            {"trainer": {"check_val_every_n_epoch": 0}},
+            "^trainer: expected check_val_every_n_epoch of at least 1, got 0",
+        ),
+        ({"trainer": {"check_val_every_n_epoch": None}}, "^trainer: expected .* got None"),
+    ],
+)
+def test_a_wrong_argument_is_named_before_anything_is_written(
+    arguments: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    data = tiny_data()
+    with pytest.raises(ValueError, match=message):
+        short_fit(Structured(dt=data.dt), data, tmp_path / "run", **arguments)
+    assert not (tmp_path / "run").exists()
+
+
 def test_epochs_are_asked_for_once(tmp_path: Path) -> None:
     data = tiny_data()
     with pytest.raises(ValueError, match=r"^trainer: expected the number of epochs as epochs="):
