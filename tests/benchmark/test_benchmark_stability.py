@@ -131,3 +131,12 @@ def test_the_easy_end_of_a_sweep_is_solved_to_rounding(name):
     row = sweep(name, 1.0, "pivoting", 0)
     assert row["solved"] == 1
     assert row["error"] < 1e-12
+
+
+def test_a_block_whose_lcp_is_not_solved_does_not_count_as_at_rest(monkeypatch):
+    def half(generator, force, sigma, entries):
+        return noise_study.Outcome(torch.zeros_like(force), torch.arange(len(force)) % 2 == 0)
+
+    monkeypatch.setitem(noise_study.FORMS, "half", half)
+    found = stick_share("half", "u = 0", "all", 0.0, samples=10, seed=0)
+    assert found == {"sticks": 0.5, "nearly_sticks": 0.5, "solved": 0.5}

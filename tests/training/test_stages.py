@@ -27,6 +27,13 @@ def test_the_rate_starts_anew_and_decays_within_a_stage():
     assert rates == sorted(rates, reverse=True)
 
 
+def test_a_softened_threshold_falls_to_a_500th_and_is_exact_from_then_on():
+    optimizer = Optimizer(anneal_epochs=100, anneal_from=2.0)
+    found = [optimizer.temperature(epoch) for epoch in (0, 50, 99, 100, 101)]
+    assert found == pytest.approx([2.0, 2.0 * 500**-0.5, 2.0 * 500**-0.99, 0.0, 0.0])
+    assert Optimizer().temperature(0) == 0.0
+
+
 def test_the_rate_of_a_stage_in_which_lbfgs_takes_over_ends_at_zero_there():
     last = plan([{"epochs": 50}], **LAST | {"epochs": 200})[-1]
     rates = [last.learning_rate(epoch, Optimizer(lbfgs_after=150)) for epoch in (50, 100, 150)]
