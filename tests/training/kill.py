@@ -33,7 +33,9 @@ class Progress(Callback):
         self.file = file
 
     def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
-        self.file.write_text(str(trainer.current_epoch))
+        beside = self.file.with_suffix(".part")  # a kill may come between the opening of a file and its writing
+        beside.write_text(str(trainer.current_epoch))
+        beside.replace(self.file)
 
 
 def train(folder: Path, width: int) -> None:
