@@ -31,6 +31,8 @@ def test_time_of_twice_the_work_is_twice_as_long():
 
     once, twice = interleave({"once": lambda: multiply(4), "twice": lambda: multiply(8)}, 9).values()
     assert twice.over(once)[0] == pytest.approx(2.0, rel=0.5)
+    middle, low, high = twice.over(once)
+    assert low <= middle <= high
     assert once.low <= once.wall <= once.high
 
 
