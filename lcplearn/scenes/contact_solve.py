@@ -35,10 +35,11 @@ def solve(problem: Problem, polygon: int | None, rest: bool) -> tuple[Answer, Te
         found, at_rest = find(problem, polygon, rest)
     if torch.is_grad_enabled() and any(x.requires_grad for x in problem):
         loaded = found.normal > 0.0
+        buckets = _buckets(loaded, loaded.any(-1) & found.solved)  # what is not solved need not be finite
         if polygon is None:
-            found = attach_gradient(problem, found, _buckets(loaded, loaded.any(-1)))
+            found = attach_gradient(problem, found, buckets)
         else:
-            found = _polygon_gradient(problem, found, polygon, _buckets(loaded, loaded.any(-1)))
+            found = _polygon_gradient(problem, found, polygon, buckets)
     return found, at_rest
 
 
@@ -114,7 +115,9 @@ def _iterate(part: Problem) -> Answer:
 
 def _polygon_gradient(problem: Problem, found: Answer, polygon: int, buckets: list[tuple[Tensor, Tensor]]) -> Answer:
     """The same answer with its gradient, that of the LCP of the contacts that are loaded."""
-    velocity, normal, friction = problem.free, torch.zeros_like(found.normal), torch.zeros_like(found.friction)
+    flies = (found.solved & ~(found.normal > 0.0).any(-1)).unsqueeze(-1)
+    velocity = torch.where(flies, problem.free, found.velocity)
+    normal, friction = found.normal.clone(), found.friction.clone()
     for elements, rows in buckets:
         part = _once(problem.pick(elements, rows), polygon)
         velocity = velocity.index_put((elements,), part.velocity)

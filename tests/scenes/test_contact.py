@@ -253,6 +253,30 @@ def test_gradients_with_needed_rows_are_those_of_differences(name):
     assert ((gradient - fine).abs() <= 1e-4 * scale)[smooth].double().mean() >= 0.98
 
 
+@pytest.mark.parametrize("polygon", [None, 4])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_nothing_goes_back_through_a_step_that_is_not_solved(compiled, polygon, monkeypatch):
+    """Here one whose highest corner has no number for its gap; the others bear loads."""
+    if not compiled:
+        monkeypatch.setattr("lcplearn.scenes.contact.compiled_contacts", lambda device: None)
+    contacts, free, mass = boxes(6, 1, compliance=1e-3)
+    free, broken = free - torch.tensor([0.0, 0.0, 10.0, 0.0, 0.0, 0.0]), contacts.gap.clone()
+    broken[5, broken[5].argmax()] = torch.nan
+
+    def slopes(count: int, gap: Tensor) -> tuple[Tensor, ...]:
+        mu, start = torch.tensor(0.3, requires_grad=True), free[:count].clone().requires_grad_()
+        given = (x[:count] for x in contacts._replace(gap=gap, mu=mu.expand(6, 8)))
+        step = contact_step(Contacts(*given), start, mass[:count], DT, polygon=polygon)
+        assert step.solved.tolist() == (torch.arange(count) < 5).tolist()
+        assert (step.normal_impulse > 0.0).any(-1).all()
+        return torch.autograd.grad(step.velocity.sum(), (mu, start))
+
+    (mu, start), (expected_mu, expected_start) = slopes(6, broken), slopes(5, contacts.gap)
+    assert mu == expected_mu != 0.0
+    assert torch.equal(start[:5], expected_start)
+    assert (start[5] == 0.0).all()
+
+
 def test_a_batch_of_gradients_is_refused():
     contacts, free, mass = boxes(2, 1)
     velocity = contact_step(contacts, free.requires_grad_(), mass, DT).velocity
