@@ -102,7 +102,8 @@ def _save(ctx: Any, M: Tensor, solution: LCPSolution, options: Options) -> None:
     ctx.smoothing, ctx.in_kernel = options.smoothing, pivots(z, options)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*saved)
-    ctx.save_for_forward(*saved)
+    if forward_mode():
+        ctx.save_for_forward(*saved)
 
 
 def batch_inputs(

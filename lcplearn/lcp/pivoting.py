@@ -6,10 +6,11 @@ Each element runs down a cascade until its residual, recomputed from the origina
 
 1. symmetric Ruiz equilibration, rounded to powers of two so that the scaled data are exact: S = E M E, p = E q / s;
 2. block principal pivoting (Newton-min with Kostreva's single-pivot safeguard) from an initial basis, or from p < 0 for
-   n < 6 and n > 40; between, where Lemke's method is faster, only to improve on what that found;
+   n > 40, and by pivots on the diagonal of a tableau for n < 6 and, where the diagonal is positive, n < 16; elsewhere,
+   where Lemke's method is faster, only to improve on what that found;
 3. Lemke's method with the lexicographic rule on the condensed tableau; where it fails, with rows and columns scaled
    apart, other pivot tolerances and another covering vector (the tolerance has the size of the data's precision: below
-   it a pivot is rounding noise);
+   it a pivot is rounding noise). Rows that symmetric scaling leaves without a large entry are scaled apart at once;
 4. a phase-one simplex method, whose optimum proves infeasibility, judged on the original data;
 5. a primal-dual interior point, for problems on which pivoting takes exponentially many steps;
 6. one size of q after the other, for problems that hold sizes far apart.

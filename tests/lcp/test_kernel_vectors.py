@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from lcplearn.lcp.kernel import vectors
+from lcplearn.lcp.kernel import square, vectors
 from lcplearn.lcp.kernel.memory import padded
 
 SIZES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 13)
@@ -12,8 +12,8 @@ SIZES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 13)
 
 @numba.njit
 def _scaling(M, rest, at, n, width):
-    vectors.largest_entries(M, rest, at[0], at[1], at[2], n)
-    vectors.scale_transposed(M, rest, at[0], at[3], at[4], n)
+    square.largest_entries(M, rest, at[0], at[1], at[2], n)
+    square.scale_transposed(M, rest, at[0], at[3], at[4], n)
     vectors.divide_by_roots(at[5], at[3], width // 4)
 
 

@@ -3,8 +3,11 @@
 import numpy as np
 
 from lcplearn.lcp.kernel.dense import COMPLETE, PARTIAL, factor, factor_call, gather, gather_call, members, solve
-from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, STUCK, jit, jit_inline, jit_merged
+from lcplearn.lcp.kernel.jit import CAPPED, DONE, EPS, STUCK, TINY, jit, jit_inline, jit_merged
 from lcplearn.lcp.kernel.judging import evaluate
+from lcplearn.lcp.kernel.lemke import exchange
+from lcplearn.lcp.kernel.memory import address, matrix
+from lcplearn.lcp.kernel.vectors import at_most, copy, first_bit
 
 
 @jit_inline
@@ -33,9 +36,10 @@ def refine(S, p, A, k, rank, rows, cols, index, z, w, omega, x, scratch):
 
 
 @jit_merged
-def polish(S, p, basis, T, place, inverted, A, rows, cols, index, z, w, omega, x, scratch):
+def polish(S, p, basis, rough, T, place, inverted, A, rows, cols, index, z, w, omega, x, scratch):
     """Refine z on the basis from the data, by the tableau's inverse of S_AA (if inverted) or else by LU.
 
+    Once at least, if the residual is more than `rough` times rounding in some row.
     A singular S_AA gives a basic solution of the consistent equations. The tableau leaves rounding noise where z_i = 0,
     as at contacts without load, whose rows then hold nothing else: it is dropped, and refinement, which brings back
     what was not noise, need not get such rows right to their own last digit.
@@ -53,7 +57,7 @@ def polish(S, p, basis, T, place, inverted, A, rows, cols, index, z, w, omega, x
     for attempt in range(2):
         wrong = 0
         for a in range(k):
-            wrong += abs(w[index[a]]) > max(32.0 * EPS * omega[index[a]], noise)
+            wrong += abs(w[index[a]]) > max((rough if attempt == 0 else 32.0) * EPS * omega[index[a]], noise)
         if wrong == 0:
             return
         if inverted and attempt == 0:
@@ -141,3 +145,32 @@ def block_pivoting(S, p, basis, A, rows, cols, index, wrong, z, w, omega, x, scr
             for i in range(n):
                 basis[i] ^= wrong[i]
     return CAPPED, cap
+
+
+@jit_merged
+def principal_pivoting(S, p, smallest, T, basic, column, place, factor, basis, z, cap):
+    """Block pivoting from p < 0 on a tableau as in lemke.py, but without z_0: each flip is a pivot on the diagonal.
+
+    One below `smallest` ends it. T then holds the inverse of S_AA, as after Lemke's method; how it ended, the rounds.
+    """
+    n = p.size
+    rows, start = S.shape[1], address(T)
+    T, values = matrix(start, n + 1, rows), start + 8 * n * rows
+    copy(start, address(S), n * rows // 4)
+    copy(values, address(p), rows // 4)
+    for i in range(n):
+        basic[i], column[i], place[i], place[n + i] = i, n + i, i, -1 - i
+    wrong, rounds = at_most(values, -TINY, rows // 4), 0
+    while wrong != 0 and rounds < cap:
+        while wrong != 0:
+            i = first_bit(wrong)
+            if not abs(T[i, i]) > smallest:
+                return STUCK, rounds
+            exchange(T, basic, column, place, i, i, factor)
+            wrong &= wrong - 1
+        rounds += 1
+        wrong = at_most(values, -64.0 * EPS, rows // 4)
+    for i in range(n):
+        basis[i] = place[n + i] >= 0
+        z[i] = max(T[n, i], 0.0) if basis[i] else 0.0
+    return DONE if wrong == 0 else CAPPED, rounds

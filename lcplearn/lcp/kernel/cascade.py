@@ -5,7 +5,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from lcplearn.lcp.kernel.block_pivoting import block_pivoting, leave_ray, polish
+from lcplearn.lcp.kernel.block_pivoting import block_pivoting, leave_ray, polish, principal_pivoting
 from lcplearn.lcp.kernel.interior_point import interior_point
 from lcplearn.lcp.kernel.islands import FEWEST_ROWS, falls_apart, seems_connected
 from lcplearn.lcp.kernel.jit import (
@@ -35,17 +35,21 @@ from lcplearn.lcp.kernel.judging import (
     scale,
 )
 from lcplearn.lcp.kernel.lemke import lemke, prove_infeasible
-from lcplearn.lcp.kernel.memory import address, pointer, workspace
+from lcplearn.lcp.kernel.memory import address, batch, fill_with_zeros, pointer, workspace
 from lcplearn.lcp.kernel.scales import solve_by_scale
 from lcplearn.lcp.kernel.vectors import inverse_of_power
 
-# The stages in their order. BLOCK is block pivoting, where it is faster than Lemke's method; IMPROVE the same from what
-# LEMKE found, unless the residual is that of rounding. Then rows and columns are scaled apart: block pivoting, Lemke's
-# method, the same with an irregular covering vector, and with a finer pivot tolerance. PATH is the interior point, and
-# REFINED its solution refined, unless the residual is that of rounding: at a singular basis that can make it worse. A
-# solution that is far out on a ray of solutions, where digits of w are lost, leaves it first.
+# The stages in their order. One of the first three at most, where it is faster than Lemke's method: that with rows and
+# columns scaled apart where one scale for both leaves rows too small (AHEAD), block pivoting on the tableau (PRINCIPAL)
+# or by LU (BLOCK). IMPROVE is BLOCK from what LEMKE found, unless the residual is that of rounding. Then rows and
+# columns are scaled apart: block pivoting, Lemke's method, the same with an irregular covering vector, and with a finer
+# pivot tolerance. PATH is the interior point, and REFINED its solution refined, unless the residual is that of
+# rounding: at a singular basis that can make it worse. A solution that is far out on a ray of solutions, where digits
+# of w are lost, leaves it first.
 # BY_SCALE goes one size of q down after the other from the best basis so far, ANEW from an empty one.
-BLOCK, LEMKE, IMPROVE, APART_BLOCK, APART_LEMKE, APART_COVER, APART_FINE, PATH, REFINED, BY_SCALE, ANEW = range(11)
+AHEAD, PRINCIPAL, BLOCK, LEMKE, IMPROVE = range(5)
+APART_BLOCK, APART_LEMKE, APART_COVER, APART_FINE, PATH, REFINED, BY_SCALE, ANEW = range(5, 13)
+AT_ONCE = 16  # elements whose fields are cleared
 
 
 @jit_merged
@@ -80,22 +84,43 @@ def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
 @jit_merged
 def next_stage(stage, capped, budget):
     """A Lemke that is capped on the second scaling too, or a budget that is used up, leaves the interior point."""
-    return PATH if capped and stage < PATH and (budget >= 0 or stage >= APART_LEMKE) else stage + 1
+    if capped and stage < PATH and (budget >= 0 or stage >= APART_LEMKE):
+        return PATH
+    return max(stage + 1, LEMKE)
 
 
 @jit_merged
-def run_stage(stage, left, budget, accepted, tol, single_precision, q, s, numbers, indices, basis_out):
+def first_stage(M, warm, scaled_apart):
+    """Where to start: the fastest of what solves most such problems."""
+    n = M.shape[0]
+    if warm or n > 40:
+        return BLOCK
+    if scaled_apart:
+        return AHEAD
+    i = n if n < 16 else 0
+    while i > 0 and M[i - 1, i - 1] > 0.0:  # a zero, which friction has in its last rows, would be a pivot
+        i -= 1
+    return PRINCIPAL if n < 6 or (n < 16 and i == 0) else LEMKE
+
+
+@jit_merged
+def run_stage(stage, left, budget, warm, accepted, tol, single_precision, q, s, numbers, indices, basis_out):
     """Leave a candidate in z, w, omega and basis; how the stage ended, and its pivots or steps."""
     n = q.size
     S, A, T, _, _, _, p, cover, z, w, omega, x, y, v, buffer = numbers
     rows, cols, index, basic, basis, column, place = indices
     ended, count = STUCK, 0
-    if stage == APART_BLOCK:
+    if stage == APART_BLOCK or (stage == BLOCK and not warm):
         for i in range(n):
             basis[i] = p[i] < 0.0
     if stage in (BLOCK, IMPROVE, APART_BLOCK):
         return block_pivoting(S, p, basis, A, rows, cols, index, basic, z, w, omega, x, y, min(20, left))
-    if stage < PATH:
+    if stage == PRINCIPAL:
+        smallest = 1e-6 if single_precision else 1e-9
+        ended, count = principal_pivoting(S, p, smallest, T, basic, column, place, x, basis, z, min(20, left))
+        if ended != DONE:
+            return ended, count
+    elif stage < PATH:
         pivot = prepare_lemke(stage, single_precision, cover)
         cap = left if budget >= 0 else 10 * n + 50
         ended, count = lemke(S, p, cover, pivot, T, basic, column, place, x, index, basis, z, cap)
@@ -113,39 +138,39 @@ def run_stage(stage, left, budget, accepted, tol, single_precision, q, s, number
             basis[i] = basis_out[i] and stage == BY_SCALE
         count = solve_by_scale(address(S), n, address(q), s, tol, left)
     if stage < PATH or stage == REFINED:  # one place: numba compiles a function anew where it is called
-        polish(S, p, basis, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
+        rough = 2.0 if stage == PRINCIPAL else 32.0  # its pivots are not chosen for size
+        polish(S, p, basis, rough, T, place, ended == DONE, A, rows, cols, index, z, w, omega, x, y)
     return ended, count
 
 
 @jit_merged
-def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out, w_out, basis_out, u_out):
+def solve_one(M, q, first, tol, single_precision, budget, warm, numbers, indices, z_out, w_out, basis_out, u_out):
     """Run the cascade for one finite element with some q_i < 0; status, residual and iterations.
 
-    What is infeasible is found out when Lemke's method first ends on a ray.
+    What is infeasible is found out when Lemke's method first ends on a ray of the congruent scaling.
     """
     n = q.size
     S, _, T, d, r, c, p, cover, z, w, omega, x, _, v, buffer = numbers
     _, _, index, basic, basis, column, place = indices
     best, used, accepted, capped, asked = np.inf, 0, False, False, False
-    first = BLOCK if warm or n < 6 or n > 40 else LEMKE
-    stage, s = first - 1, 1.0
-    while stage < ANEW and not (accepted and ((stage != LEMKE and stage != PATH) or best <= 1e-3 * tol)):
-        stage = next_stage(stage, capped, budget)
+    stage, s = -1, 1.0
+    while stage < ANEW and not (accepted and (stage not in (AHEAD, PRINCIPAL, LEMKE, PATH) or best <= 1e-3 * tol)):
+        stage = first if stage < 0 else next_stage(stage, capped, budget)
         left = budget - used if budget >= 0 else 20 * n + 100
         if left <= 0:
             capped = True
             break
-        if stage in (first, APART_BLOCK, PATH):
+        if stage in (first, APART_BLOCK, PATH) or (stage == LEMKE and first == AHEAD):
             for i in range(n):
                 r[i] = c[i] = d[i]
-            if stage == APART_BLOCK:
+            if stage in (AHEAD, APART_BLOCK):
                 rescale(M, r, c, x)
             s = scale(M, q, r, c, buffer, S, p)
         ended, count = run_stage(
-            stage, left, budget, accepted, tol, single_precision, q, s, numbers, indices, basis_out
+            stage, left, budget, warm, accepted, tol, single_precision, q, s, numbers, indices, basis_out
         )
         used += count
-        if stage in (BLOCK, IMPROVE, APART_BLOCK):
+        if stage in (PRINCIPAL, BLOCK, IMPROVE, APART_BLOCK):
             if ended != DONE:
                 continue
         elif stage < PATH:
@@ -160,7 +185,7 @@ def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out
         if (good and not accepted) or (residual < best and (good or not accepted)):
             holds = write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out)
             best, accepted = residual if holds else np.inf, good and holds
-        if ended == STUCK and not asked and not accepted:
+        if ended == STUCK and stage != AHEAD and not asked and not accepted:
             asked = True
             margin = 1e-3 if single_precision else 1e-9  # rounding of the data to float32 proves nothing
             if prove_infeasible(M, q, S, p, r, cover, T, basic, column, place, x, index, v, margin, 20 * n + 50):
@@ -168,6 +193,20 @@ def solve_one(M, q, tol, single_precision, budget, warm, numbers, indices, z_out
                     u_out[i] = v[i]
                 return INFEASIBLE, best, used
     return (SOLVED if accepted else MAX_ITERATIONS if capped else UNSOLVED), best, used
+
+
+@jit_merged
+def clear_fields(start, count, n, warm, fields):
+    """Zero the fields of some elements, which hold until a stage has a candidate; an initial basis stays."""
+    z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at = fields
+    for at in (z_at, w_at, u_at):
+        fill_with_zeros(at + 8 * n * start, count * n)
+    for at in (residual_at, status_at, iterations_at):
+        fill_with_zeros(at + 8 * start, count)
+    if not warm:
+        basis = numba.carray(pointer(basis_at + n * start, False), (count * n,))
+        for i in range(count * n):
+            basis[i] = False
 
 
 def _make(sources: str) -> Any:
@@ -181,21 +220,19 @@ def _make(sources: str) -> Any:
         and its u is the label of each row's island.
         """
         sources  # noqa: B018 - in the closure, for numba's cache
-        Ms, qs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(pointer(q_at, 0.0), (B, n))
-        zs, ws = numba.carray(pointer(z_at, 0.0), (B, n)), numba.carray(pointer(w_at, 0.0), (B, n))
-        us, bases = numba.carray(pointer(u_at, 0.0), (B, n)), numba.carray(pointer(basis_at, False), (B, n))
-        residuals, statuses = numba.carray(pointer(residual_at, 0.0), (B,)), numba.carray(pointer(status_at, 0), (B,))
-        iterations = numba.carray(pointer(iterations_at, 0), (B,))
+        fields = z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at
+        Ms, qs, zs, ws, bases, residuals, statuses, iterations, us = batch(B, n, shared, M_at, q_at, fields)
         numbers, indices = workspace(address(scratch), n)
         _, _, _, d, _, _, _, _, _, _, _, x, y, _, buffer = numbers
         _, _, index, basic, basis, _, _ = indices
         left = 0
         for b in range(B):
             Mb, qb = Ms[0 if shared else b], qs[b]
-            for i in range(n):  # until a stage has a candidate
-                basis[i] = bases[b, i] if warm else qb[i] < 0.0
-                zs[b, i], ws[b, i], bases[b, i], us[b, i] = 0.0, 0.0, False, 0.0
-            residuals[b], statuses[b], iterations[b] = 0.0, SOLVED, 0
+            if b % AT_ONCE == 0:
+                clear_fields(b, min(AT_ONCE, B - b), n, warm, fields)
+            if warm:
+                for i in range(n):
+                    basis[i], bases[b, i] = bases[b, i], False
             if not (all_finite(qb) and all_finite(Mb)):
                 for i in range(n):
                     zs[b, i], ws[b, i] = np.nan, np.nan
@@ -211,9 +248,9 @@ def _make(sources: str) -> Any:
                 statuses[b] = APART
                 left += 1
                 continue
-            equilibrate(Mb, y, x, buffer, d)
+            first = first_stage(Mb, warm, equilibrate(Mb, y, x, buffer, d))
             statuses[b], residuals[b], iterations[b] = solve_one(
-                Mb, qb, tol, single_precision, budget, warm, numbers, indices, zs[b], ws[b], bases[b], us[b]
+                Mb, qb, first, tol, single_precision, budget, warm, numbers, indices, zs[b], ws[b], bases[b], us[b]
             )
             left += statuses[b] == UNSOLVED
         return left

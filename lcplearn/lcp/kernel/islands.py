@@ -24,7 +24,7 @@ from lcplearn.lcp.kernel.jit import (
     jit,
     jit_merged,
 )
-from lcplearn.lcp.kernel.memory import address, integers, matrix, pointer, vector
+from lcplearn.lcp.kernel.memory import address, batch, integers, matrix, pointer, vector
 
 FEWEST_ROWS = 24  # below, to look for islands takes longer than what most of them gain
 # Solving apart is worth while where this, counted in squares of rows, is at most so much of the whole:
@@ -110,6 +110,82 @@ def islands_memory(n: int) -> int:
     return n * n + 12 * n + 3
 
 
+@jit_merged
+def part_memory(at, n):
+    """For an island's q, z, w, u and basis, a line of n numbers each, and its residual, status and iterations."""
+    line = 8 * n
+    q, z, w, u = vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n)
+    basis, behind = numba.carray(pointer(at + 4 * line, False), (n,)), at + 5 * line
+    return q, z, w, u, basis, vector(behind, 1), integers(behind, 3)
+
+
+@jit_merged
+def solve_island(solver, M, qs, bases, rows, tol, single_precision, budget, warm, scratch, at, block_at):
+    """Solve the rows of one island of an element; the answer is in the `part_memory` at `at`."""
+    m, line = rows.size, 8 * qs.size
+    q, z, w, u, basis, residual, ended = part_memory(at, qs.size)
+    easy = True
+    for a in range(m):
+        i = rows[a]
+        q[a], z[a], w[a], u[a], basis[a] = qs[i], 0.0, qs[i], 0.0, False
+        easy = easy and q[a] >= 0.0
+    residual[0], ended[1], ended[2] = 0.0, SOLVED, 0
+    if not easy and budget == 0:
+        ended[1] = MAX_ITERATIONS
+    elif not easy and m == 1:
+        z[0], w[0], ended[1] = solve_single(M[rows[0], rows[0]], q[0])
+        u[0], basis[0], ended[2] = 1.0, ended[1] == SOLVED, 1
+    elif not easy:
+        block = matrix(block_at, m, m)
+        for a in range(m):
+            basis[a] = bases[rows[a]]
+            for c in range(m):
+                block[a, c] = M[rows[a], rows[c]]
+        call(solver, (
+            1, m, False, block_at, at, tol, single_precision, budget, warm, False, scratch, at + line, at + 2 * line,
+            at + 4 * line, at + 5 * line, at + 5 * line + 8, at + 5 * line + 16, at + 3 * line,
+        ))  # fmt: skip
+
+
+@jit_merged
+def solve_apart(solver, M, qs, bases, us, tol, single_precision, budget, warm, scratch, memory):
+    """Solve the islands whose labels are in `us`, one after the other, until one is not SOLVED.
+
+    Status, residual and iterations of the whole. It leaves z, w and basis in `memory`, and the proof of what is
+    infeasible in `us`.
+    """
+    n = qs.size
+    line, at = 8 * n, address(memory)
+    z_all, w_all, basis_all = vector(at, n), vector(at + line, n), integers(at + 2 * line, n)
+    label, order = integers(at + 3 * line, n), integers(at + 4 * line, n)
+    sizes, ends, part_at = integers(at + 5 * line, n), integers(at + 6 * line, n), at + 7 * line
+    _, z, w, u, basis, part_residual, ended = part_memory(part_at, n)
+    for i in range(n):
+        label[i], us[i] = int(us[i]), 0.0
+    sort_rows(label, sizes, ends, order)
+    residual, used, status, total = 0.0, 0, SOLVED, 0.0
+    for island in range(n):
+        if status != SOLVED:
+            break
+        if sizes[island] == 0:
+            continue
+        rows = order[ends[island] - sizes[island] : ends[island]]
+        left = max(budget - used, 0) if budget >= 0 else -1
+        solve_island(
+            solver, M, qs, bases, rows, tol, single_precision, left, warm, scratch, part_at, part_at + 5 * line + 24
+        )
+        used += ended[2]
+        residual, status = max(residual, part_residual[0]), ended[1]
+        for a in range(rows.size):
+            i = rows[a]
+            z_all[i], w_all[i], basis_all[i] = z[a], w[a], basis[a]
+            total += z[a] + abs(w[a])
+            us[i] = u[a] if status == INFEASIBLE else 0.0
+        if status == SOLVED and not (part_residual[0] <= MARGIN * tol and total <= LARGEST):
+            status = UNSOLVED
+    return status, residual, used
+
+
 def _make(sources: str) -> Any:
     def solve_islands(
         solver, B, n, shared, M_at, q_at, tol, single_precision, budget, warm, scratch, memory,
@@ -123,69 +199,18 @@ def _make(sources: str) -> Any:
             memory: Of `islands_memory(n)` numbers.
         """
         sources  # noqa: B018 - in the closure, for numba's cache
-        Ms, qs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), numba.carray(pointer(q_at, 0.0), (B, n))
-        zs, ws = numba.carray(pointer(z_at, 0.0), (B, n)), numba.carray(pointer(w_at, 0.0), (B, n))
-        us, bases = numba.carray(pointer(u_at, 0.0), (B, n)), numba.carray(pointer(basis_at, False), (B, n))
-        residuals, statuses = numba.carray(pointer(residual_at, 0.0), (B,)), numba.carray(pointer(status_at, 0), (B,))
-        iterations = numba.carray(pointer(iterations_at, 0), (B,))
-        at, line = address(memory), 8 * n
-        q, z, w, u = vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n)
-        basis = numba.carray(pointer(at + 4 * line, False), (n,))
-        label, order = integers(at + 5 * line, n), integers(at + 6 * line, n)
-        z_all, w_all, basis_all = vector(at + 7 * line, n), vector(at + 8 * line, n), integers(at + 9 * line, n)
-        sizes, ends = integers(at + 10 * line, n), integers(at + 11 * line, n)
-        found, at_found = vector(at + 12 * line, 3), at + 12 * line
-        ended, block_at = integers(at_found, 3), at_found + 24
-        unsolved = 0
+        fields = z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at
+        Ms, qs, zs, ws, bases, residuals, statuses, iterations, us = batch(B, n, shared, M_at, q_at, fields)
+        at, line, unsolved = address(memory), 8 * n, 0
+        z, w, basis = vector(at, n), vector(at + line, n), integers(at + 2 * line, n)
         for b in range(B):
             if statuses[b] != APART:
                 unsolved += statuses[b] == UNSOLVED
                 continue
             M = Ms[0 if shared else b]
-            for i in range(n):
-                label[i], us[b, i] = int(us[b, i]), 0.0
-            sort_rows(label, sizes, ends, order)
-            residual, used, status, total = 0.0, 0, SOLVED, 0.0
-            for island in range(n):
-                m = sizes[island]
-                if m == 0:
-                    continue
-                rows, block = order[ends[island] - m :], matrix(block_at, m, m)
-                easy = True
-                for a in range(m):
-                    i = rows[a]
-                    q[a], z[a], w[a], u[a], basis[a] = qs[b, i], 0.0, qs[b, i], 0.0, False
-                    easy = easy and q[a] >= 0.0
-                found[0], ended[1], ended[2] = 0.0, SOLVED, 0
-                if not easy and used == budget:
-                    ended[1] = MAX_ITERATIONS
-                elif not easy and m == 1:
-                    z[0], w[0], ended[1] = solve_single(M[island, island], q[0])
-                    u[0], basis[0], ended[2] = 1.0, ended[1] == SOLVED, 1
-                elif not easy:
-                    for a in range(m):
-                        basis[a] = bases[b, rows[a]]
-                        for c in range(m):
-                            block[a, c] = M[rows[a], rows[c]]
-                    call(solver, (
-                        1, m, False, block_at, at, tol, single_precision, max(budget - used, 0) if budget >= 0 else -1,
-                        warm, False, scratch, at + line, at + 2 * line, at + 4 * line, at_found, at_found + 8,
-                        at_found + 16, at + 3 * line,
-                    ))  # fmt: skip
-                used += ended[2]
-                residual = max(residual, found[0])
-                for a in range(m):
-                    i = rows[a]
-                    z_all[i], w_all[i], basis_all[i] = z[a], w[a], basis[a]
-                    total += z[a] + abs(w[a])
-                status = ended[1]
-                if status == SOLVED and not (found[0] <= MARGIN * tol and total <= LARGEST):
-                    status = UNSOLVED
-                if status == INFEASIBLE:
-                    for a in range(m):
-                        us[b, rows[a]] = u[a]
-                if status != SOLVED:
-                    break
+            status, residual, used = solve_apart(
+                solver, M, qs[b], bases[b], us[b], tol, single_precision, budget, warm, scratch, memory
+            )
             if status == UNSOLVED or (status == MAX_ITERATIONS and budget < 0):
                 call(solver, (
                     1, n, False, address(M), q_at + b * line, tol, single_precision,
@@ -198,9 +223,9 @@ def _make(sources: str) -> Any:
                 continue
             residuals[b], statuses[b], iterations[b] = residual if status == SOLVED else np.inf, status, used
             for i in range(n):
-                bases[b, i] = status == SOLVED and basis_all[i] != 0
+                bases[b, i] = status == SOLVED and basis[i] != 0
                 if status == SOLVED:
-                    zs[b, i], ws[b, i] = z_all[i], w_all[i]
+                    zs[b, i], ws[b, i] = z[i], w[i]
         return unsolved
 
     return solve_islands

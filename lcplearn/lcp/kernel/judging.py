@@ -6,15 +6,18 @@ import numpy as np
 
 from lcplearn.lcp.kernel.jit import EPS, LARGEST, RUIZ_SWEEPS, TINY, jit, jit_call, jit_inline, jit_merged
 from lcplearn.lcp.kernel.memory import address, padded, vector
+from lcplearn.lcp.kernel.square import largest_entries, scale_transposed
 from lcplearn.lcp.kernel.vectors import (
     add_columns,
     divide_by_roots,
     even_out,
+    fill,
     inverse_of_power,
-    largest_entries,
     power_below,
-    scale_transposed,
+    powers_below,
 )
+
+SMALL_ROW = 1e-4  # the largest entry of a row where that of its column is about 1
 
 
 @jit
@@ -67,20 +70,26 @@ def equilibrate_few(M, largest, d):
 
 @jit_merged
 def equilibrate(M, rows, largest, rest, d):
-    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; rows, largest and rest are scratch."""
+    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; whether some row is left without a large entry.
+
+    rows and largest are scratch; rest gets the end of M's last row, for `scale`.
+    """
     n = d.size
     if n < 4:
         equilibrate_few(M, largest, d)
-        return
-    scales, blocks = vector(address(d), padded(n)), padded(n) // 4
-    for i in range(padded(n)):
-        scales[i] = 1.0
+        return False
+    blocks = padded(n) // 4
+    fill(address(d), 1.0, blocks)
     copy_rest(M, rest)
     for _ in range(RUIZ_SWEEPS):
         largest_entries(address(M), address(rest), address(d), address(rows), address(largest), n)
         if not even_out(address(rows), address(largest), address(d), 1.3, 0.83, TINY, blocks):  # as in residuals.py
-            break
+            return False
         divide_by_roots(address(d), address(largest), blocks)
+    small = 0  # beside that of their column, which counts as much
+    for i in range(n):
+        small += (rows[i] > 0.0) & (rows[i] * d[i] < SMALL_ROW)
+    return small > 0
 
 
 @jit
@@ -105,32 +114,38 @@ def rescale(M, r, c, largest):
 
 @jit_merged
 def scale(M, q, r, c, rest, S, p):
-    """S = R M C and p = R q / s without rounding, as r, c and s become powers of two; returns s. rest is scratch.
+    """S = R M C and p = R q / s without rounding, as r, c and s become powers of two; returns s.
 
-    S is stored by columns, S[j, i], that are padded with zeros. A solution z', w' for S and p is z = s C z',
+    rest is what `equilibrate` left there: the end of M's last row.
+
+    S is stored by columns, S[j, i], that are padded with zeros, as p is. A solution z', w' for S and p is z = s C z',
     w = s R^-1 w' for M and q.
     """
-    n = q.size
+    n, width = q.size, S.shape[1]
+    if n < 4:
+        for i in range(n):
+            r[i], c[i] = power_below(r[i]), power_below(c[i])
+    else:
+        powers_below(address(r), width // 4)
+        powers_below(address(c), width // 4)
     s = TINY
     for i in range(n):
-        r[i], c[i] = power_below(r[i]), power_below(c[i])
         s = max(s, abs(r[i] * q[i]))
     s = power_below(s)
     inverse = 1.0 / s
     for i in range(n):
         p[i] = r[i] * q[i] * inverse
-    if n < 4:
-        for i in range(n):
-            for j in range(n, 4):
-                S[i, j] = 0.0
-            for j in range(n):
-                S[i, j] = r[j] * M[j, i] * c[i]
+    r_padded, p_padded = vector(address(r), width), vector(address(p), width)
+    for i in range(n, width):
+        r_padded[i] = p_padded[i] = 0.0
+    if n >= 4:
+        scale_transposed(address(M), address(rest), address(r), address(c), address(S), n)
         return s
-    padding = vector(address(r), S.shape[1])
-    for i in range(n, S.shape[1]):
-        padding[i] = 0.0
-    copy_rest(M, rest)
-    scale_transposed(address(M), address(rest), address(r), address(c), address(S), n)
+    for i in range(n):
+        for j in range(n, 4):
+            S[i, j] = 0.0
+        for j in range(n):
+            S[i, j] = r[j] * M[j, i] * c[i]
     return s
 
 

@@ -51,6 +51,24 @@ def integers(at, size):
     return numba.carray(pointer(at, 0), (size,))
 
 
+@jit_merged
+def batch(B, n, shared, M_at, q_at, fields):
+    """Views of a batch of B problems of size n, and of the fields of its LCPSolution, given by their addresses."""
+    z_at, w_at, basis_at, residual_at, status_at, iterations_at, u_at = fields
+    Ms, qs = numba.carray(pointer(M_at, 0.0), (1 if shared else B, n, n)), matrix(q_at, B, n)
+    zs, ws, us = matrix(z_at, B, n), matrix(w_at, B, n), matrix(u_at, B, n)
+    bases, residuals = numba.carray(pointer(basis_at, False), (B, n)), vector(residual_at, B)
+    return Ms, qs, zs, ws, bases, residuals, integers(status_at, B), integers(iterations_at, B), us
+
+
+@jit
+def fill_with_zeros(at, size):
+    """Zero numbers of 8 bytes at an address."""
+    numbers = integers(at, size)
+    for i in range(size):
+        numbers[i] = 0
+
+
 @jit
 def padded(n):
     """The size as a multiple of 4."""

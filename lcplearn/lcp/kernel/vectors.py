@@ -1,8 +1,7 @@
 """Operations on vectors of 4 doubles, which LLVM does not find by itself.
 
 Its loop vectoriser leaves rests of up to 15 entries to scalars, and numba switches the other one off. Arrays are given
-by their address, and are padded to whole vectors. Only M, the caller's, is not: the last vector of a row reaches into
-the next row, and is masked; that of the last row is read from a copy, `rest`.
+by their address, and are padded to whole vectors. Only M, the caller's, is not: see square.py.
 """
 
 from collections.abc import Callable
@@ -21,7 +20,7 @@ FOUR, BITS = ir.VectorType(DOUBLE, 4), ir.VectorType(I64, 4)
 ZERO, INFINITE = (ir.Constant(FOUR, [x] * 4) for x in (0.0, float("inf")))
 
 
-class _Code:
+class Code:
     """What the operations are made of; an instruction is written when its method is called."""
 
     def __init__(self, builder: Any) -> None:
@@ -70,13 +69,13 @@ class _Code:
         return self.builder.fadd(a, product, flags=("contract",))
 
 
-def _operation(arguments: str, result: types.Type = types.void) -> Callable[[Callable[..., Any]], Any]:
+def operation(arguments: str, result: types.Type = types.void) -> Callable[[Callable[..., Any]], Any]:
     """Make an intrinsic of a function that writes code; its arguments are integers and addresses (i) or doubles (d)."""
     kinds = [types.float64 if kind == "d" else types.int64 for kind in arguments]
 
     def decorate(write: Callable[..., Any]) -> Any:
         def codegen(context: Any, builder: Any, _: Any, args: Any) -> Any:
-            value = write(_Code(builder), builder, *args)
+            value = write(Code(builder), builder, *args)
             return context.get_dummy_value() if value is None else value
 
         def typed(_: Any, *__: Any) -> Any:
@@ -91,8 +90,34 @@ def _operation(arguments: str, result: types.Type = types.void) -> Callable[[Cal
     return decorate
 
 
-@_operation("iiiii")
-def add_product(v: _Code, builder: Any, target: Any, factors: Any, source: Any, columns: Any, blocks: Any) -> None:
+@operation("iii")
+def copy(v: Code, builder: Any, target: Any, source: Any, blocks: Any) -> None:
+    """target = source; a loop over numbers leaves a rest to scalars, for which the next load of a vector waits."""
+    target, source = v.vectors(target), v.vectors(source)
+    with cgutils.for_range(builder, blocks) as block:
+        v.store(v.load(source, block.index), target, block.index)
+
+
+@operation("idi")
+def fill(v: Code, builder: Any, target: Any, value: Any, blocks: Any) -> None:
+    """target = value."""
+    target, value = v.vectors(target), v.splat(value)
+    with cgutils.for_range(builder, blocks) as block:
+        v.store(value, target, block.index)
+
+
+@operation("ii")
+def powers_below(v: Code, builder: Any, target: Any, blocks: Any) -> None:
+    """target = the largest powers of two that are at most target > 0."""
+    target = v.vectors(target)
+    with cgutils.for_range(builder, blocks) as block:
+        bits = builder.bitcast(v.load(target, block.index), BITS)
+        power = builder.and_(bits, ir.Constant(BITS, [EXPONENT] * 4))
+        v.store(builder.bitcast(power, FOUR), target, block.index)
+
+
+@operation("iiiii")
+def add_product(v: Code, builder: Any, target: Any, factors: Any, source: Any, columns: Any, blocks: Any) -> None:
     """target[j] += factors[j] * source for columns of vectors, a block of rows after the other."""
     target, source, factors = v.vectors(target), v.vectors(source), v.doubles(factors)
     with cgutils.for_range(builder, blocks) as row:
@@ -102,8 +127,8 @@ def add_product(v: _Code, builder: Any, target: Any, factors: Any, source: Any, 
             v.store(v.plus(v.load(at), s, v.splat(v.load(factors, column.index))), at)
 
 
-@_operation("iiiiii")
-def exchange_columns(v: _Code, builder: Any, T: Any, factors: Any, c: Any, row: Any, columns: Any, blocks: Any) -> None:
+@operation("iiiiii")
+def exchange_columns(v: Code, builder: Any, T: Any, factors: Any, c: Any, row: Any, columns: Any, blocks: Any) -> None:
     """T[j, i] += factors[j] T[c, i], but T[j, row] = factors[j] and T[c, i] = factors[c] T[c, i]."""
     T, factors = v.vectors(T), v.doubles(factors)
     pivots = builder.gep(T, [builder.mul(c, blocks)])
@@ -119,8 +144,8 @@ def exchange_columns(v: _Code, builder: Any, T: Any, factors: Any, c: Any, row: 
             v.store(v.plus(kept, s, v.splat(v.load(factors, column.index))), at)
 
 
-@_operation("iiiiiii")
-def add_columns(v: _Code, builder: Any, S: Any, p: Any, z: Any, w: Any, omega: Any, columns: Any, blocks: Any) -> None:
+@operation("iiiiiii")
+def add_columns(v: Code, builder: Any, S: Any, p: Any, z: Any, w: Any, omega: Any, columns: Any, blocks: Any) -> None:
     """w = p + sum_j S[j] z[j] and omega = |p| + sum_j |S[j] z[j]|, a block of rows after the other."""
     S, p, w, omega, z = v.vectors(S), v.vectors(p), v.vectors(w), v.vectors(omega), v.doubles(z)
     with cgutils.for_range(builder, blocks) as row:
@@ -135,80 +160,9 @@ def add_columns(v: _Code, builder: Any, S: Any, p: Any, z: Any, w: Any, omega: A
         v.store(builder.load(size), omega, row.index)
 
 
-class _Square:
-    """The rows of a square matrix of the caller, in vectors."""
-
-    def __init__(self, v: _Code, M: Any, rest: Any, size: Any) -> None:
-        self.v, self.builder, self.size = v, v.builder, size
-        self.M, self.rest = v.doubles(M), v.vectors(rest)
-        self.whole = self.builder.sdiv(size, I64(4))
-        self.blocks = self.builder.sdiv(self.builder.add(size, I64(3)), I64(4))
-        self.some = self.builder.icmp_signed("!=", self.whole, self.blocks)
-        self.mask = self.within(self.builder.mul(self.whole, I64(4)))
-
-    def within(self, start: Any) -> Any:
-        """Bits that keep the entries of a vector that starts there and are in the matrix."""
-        rest = self.builder.bitcast(
-            self.v.splat(self.builder.bitcast(self.builder.sub(self.size, start), DOUBLE)), BITS
-        )
-        lanes = ir.Constant(BITS, list(range(4)))
-        return self.builder.sext(self.builder.icmp_signed("<", lanes, rest), BITS)
-
-    def keep(self, mask: Any, vector: Any) -> Any:
-        return self.builder.bitcast(self.builder.and_(mask, self.builder.bitcast(vector, BITS)), FOUR)
-
-    def rows(self, block: Any) -> list[tuple[Any, Any, Any]]:
-        """Number, start and whether it is the last, of four rows; those beyond the last are that again."""
-        last, found = self.builder.sub(self.size, I64(1)), []
-        for k in range(4):
-            i = self.builder.add(self.builder.mul(block, I64(4)), I64(k))
-            inside = self.builder.icmp_signed("<", i, last)
-            i = self.builder.select(inside, i, last)
-            start = self.builder.gep(self.M, [self.builder.mul(i, self.size)])
-            found.append((i, start, self.builder.not_(inside)))
-        return found
-
-    def entries(self, row: tuple[Any, Any, Any], block: Any) -> Any:
-        return self.v.load(self.v.four_at(row[1], self.builder.mul(block, I64(4))))
-
-    def last_entries(self, row: tuple[Any, Any, Any]) -> Any:
-        inside = self.v.four_at(row[1], self.builder.mul(self.whole, I64(4)))
-        return self.keep(self.mask, self.v.load(self.builder.select(row[2], self.rest, inside)))
-
-
-@_operation("iiiiii")
-def largest_entries(v: _Code, builder: Any, M: Any, rest: Any, scales: Any, rows: Any, columns: Any, size: Any) -> None:
-    """rows[i] = max_j |M_ij| scales_j and columns[j] = max_i |M_ij| scales_i of a square M; 0 in the padding."""
-    square, one = _Square(v, M, rest, size), v.doubles(scales)
-    scales, rows, columns = (v.vectors(x) for x in (scales, rows, columns))
-    with cgutils.for_range(builder, square.blocks) as block:
-        v.store(ZERO, columns, block.index)
-    with cgutils.for_range(builder, square.blocks) as down:
-        four = square.rows(down.index)
-        factors = [v.splat(v.load(one, i)) for i, *_ in four]
-        largest = [cgutils.alloca_once_value(builder, ZERO) for _ in four]
-
-        def take(block: Any, entries: list[Any]) -> None:
-            column, scale = v.load(columns, block), v.load(scales, block)
-            for x, factor, best in zip(map(v.magnitude, entries), factors, largest, strict=True):
-                column = v.choose(">", builder.fmul(x, factor), column)
-                builder.store(v.choose(">", builder.fmul(x, scale), builder.load(best)), best)
-            v.store(column, columns, block)
-
-        with cgutils.for_range(builder, square.whole) as across:
-            take(across.index, [square.entries(row, across.index) for row in four])
-        with builder.if_then(square.some):
-            take(square.whole, [square.last_entries(row) for row in four])
-        a, b, c, d = (builder.load(best) for best in largest)
-        ab = v.choose(">", v.shuffle(a, b, [0, 4, 2, 6]), v.shuffle(a, b, [1, 5, 3, 7]))
-        cd = v.choose(">", v.shuffle(c, d, [0, 4, 2, 6]), v.shuffle(c, d, [1, 5, 3, 7]))
-        row = v.choose(">", v.shuffle(ab, cd, [0, 1, 4, 5]), v.shuffle(ab, cd, [2, 3, 6, 7]))
-        v.store(square.keep(square.within(builder.mul(down.index, I64(4))), row), rows, down.index)
-
-
-@_operation("iiidddi", types.int64)
+@operation("iiidddi", types.int64)
 def even_out(
-    v: _Code, builder: Any, rows: Any, columns: Any, scales: Any, middle: Any, reach: Any, tiny: Any, blocks: Any
+    v: Code, builder: Any, rows: Any, columns: Any, scales: Any, middle: Any, reach: Any, tiny: Any, blocks: Any
 ) -> Any:
     """columns = max(rows, columns) scales, 1 for 0, at least tiny; not 0 if one is further than reach from middle."""
     rows, columns, scales = v.vectors(rows), v.vectors(columns), v.vectors(scales)
@@ -225,8 +179,8 @@ def even_out(
     return builder.load(uneven)
 
 
-@_operation("iii")
-def divide_by_roots(v: _Code, builder: Any, target: Any, squares: Any, blocks: Any) -> None:
+@operation("iii")
+def divide_by_roots(v: Code, builder: Any, target: Any, squares: Any, blocks: Any) -> None:
     """target /= sqrt(squares)."""
     target, squares = v.vectors(target), v.vectors(squares)
     root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(FOUR, [FOUR]), "llvm.sqrt.v4f64")
@@ -235,33 +189,8 @@ def divide_by_roots(v: _Code, builder: Any, target: Any, squares: Any, blocks: A
         v.store(builder.fdiv(v.load(target, block.index), divisor), target, block.index)
 
 
-@_operation("iiiiii")
-def scale_transposed(v: _Code, builder: Any, M: Any, rest: Any, r: Any, c: Any, S: Any, size: Any) -> None:
-    """S[j, i] = r_i M_ij c_j for a square M; r must be 0 in its padding, and S have room for square blocks."""
-    square, r, c, S = _Square(v, M, rest, size), v.doubles(r), v.vectors(c), v.vectors(S)
-    with cgutils.for_range(builder, square.blocks) as down:
-        four, first = square.rows(down.index), builder.mul(down.index, I64(4))
-        factors = [v.splat(v.load(r, builder.add(first, I64(k)))) for k in range(4)]
-
-        def put(block: Any, entries: list[Any]) -> None:
-            columns = v.load(c, block)
-            x = [builder.fmul(builder.fmul(f, e), columns) for f, e in zip(factors, entries, strict=True)]
-            even = [v.shuffle(x[k], x[k + 1], [0, 4, 2, 6]) for k in (0, 2)]
-            odd = [v.shuffle(x[k], x[k + 1], [1, 5, 3, 7]) for k in (0, 2)]
-            for k in range(4):
-                a, b = (even, odd)[k % 2]
-                column = v.shuffle(a, b, [0, 1, 4, 5] if k < 2 else [2, 3, 6, 7])
-                j = builder.add(builder.mul(block, I64(4)), I64(k))
-                v.store(column, S, builder.add(builder.mul(j, square.blocks), down.index))
-
-        with cgutils.for_range(builder, square.whole) as across:
-            put(across.index, [square.entries(row, across.index) for row in four])
-        with builder.if_then(square.some):
-            put(square.whole, [square.last_entries(row) for row in four])
-
-
-@_operation("iiidi", types.float64)
-def smallest_ratio(v: _Code, builder: Any, slopes: Any, values: Any, ratios: Any, tolerance: Any, blocks: Any) -> Any:
+@operation("iiidi", types.float64)
+def smallest_ratio(v: Code, builder: Any, slopes: Any, values: Any, ratios: Any, tolerance: Any, blocks: Any) -> Any:
     """ratios = max(values, 0) / -slopes where -slopes > tolerance, else infinite; the smallest of them."""
     slopes, values, ratios = v.vectors(slopes), v.vectors(values), v.vectors(ratios)
     tolerance, best = v.splat(tolerance), cgutils.alloca_once_value(builder, INFINITE)
@@ -274,8 +203,8 @@ def smallest_ratio(v: _Code, builder: Any, slopes: Any, values: Any, ratios: Any
     return v.across("<", builder.load(best))
 
 
-@_operation("idi", types.int64)
-def at_most(v: _Code, builder: Any, numbers: Any, bound: Any, blocks: Any) -> Any:
+@operation("idi", types.int64)
+def at_most(v: Code, builder: Any, numbers: Any, bound: Any, blocks: Any) -> Any:
     """Bit i says whether number i is at most the bound; up to 64 of them."""
     numbers, bound = v.vectors(numbers), v.splat(bound)
     found = cgutils.alloca_once_value(builder, I64(0))
@@ -286,19 +215,19 @@ def at_most(v: _Code, builder: Any, numbers: Any, bound: Any, blocks: Any) -> An
     return builder.load(found)
 
 
-@_operation("i", types.int64)
-def first_bit(v: _Code, builder: Any, bits: Any) -> Any:
+@operation("i", types.int64)
+def first_bit(v: Code, builder: Any, bits: Any) -> Any:
     """The number of the lowest bit that is set."""
     return builder.cttz(bits, ir.IntType(1)(0))
 
 
-@_operation("d", types.float64)
-def power_below(v: _Code, builder: Any, x: Any) -> Any:
+@operation("d", types.float64)
+def power_below(v: Code, builder: Any, x: Any) -> Any:
     """The largest power of two that is at most x > 0."""
     return builder.bitcast(builder.and_(builder.bitcast(x, I64), I64(EXPONENT)), DOUBLE)
 
 
-@_operation("d", types.float64)
-def inverse_of_power(v: _Code, builder: Any, x: Any) -> Any:
+@operation("d", types.float64)
+def inverse_of_power(v: Code, builder: Any, x: Any) -> Any:
     """1 / x of a power of two up to 2^1022."""
     return builder.bitcast(builder.sub(I64(2046 << 52), builder.bitcast(x, I64)), DOUBLE)
