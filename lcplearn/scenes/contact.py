@@ -93,12 +93,14 @@ def closing_speed(
         before: Normal speed before the step [m/s].
         free: Normal speed after the step if nothing touched [m/s].
         dt: Step size [s].
-        law: "newton" is the speed before the step, -before, of a contact that would close; it jumps where a contact
-            begins to. "continuous" is the part of it that is left when the gap is used up, -before - max(gap, 0) / dt.
+        law: "newton" is the speed before the step, -before, of a contact that would close, and 0 up to the speed that
+            the forces give it within the step: else a body that lies goes on bouncing ever lower. It jumps at both
+            ends. "continuous" is the part of it that is left when the gap is used up, -before - max(gap, 0) / dt.
     """
     if law == "continuous":
         return torch.relu(-before - torch.relu(gap) / dt)
-    return torch.where(gap + dt * free < 0.0, torch.relu(-before), 0.0)
+    gained = torch.relu(before - free)
+    return torch.where((gap + dt * free < 0.0) & (-before > gained), -before, 0.0)
 
 
 def rebound(

@@ -38,7 +38,8 @@ def approach(x, R, gravity, force, corners, mass, numbers, dt, newton, gyroscopi
             before += normal[i, k] * x[7 + k]
             after_free += normal[i, k] * free[k]
         if newton:
-            closing[i] = max(-before, 0.0) if gap[i] + dt * after_free < 0.0 else 0.0
+            gained = max(before - after_free, 0.0)
+            closing[i] = -before if gap[i] + dt * after_free < 0.0 and -before > gained else 0.0
         else:
             closing[i] = max(-before - max(gap[i], 0.0) / dt, 0.0)
 

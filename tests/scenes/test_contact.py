@@ -307,6 +307,12 @@ def test_restitution_newton_and_continuous():
         assert rebound(gap, closing, torch.tensor(0.5).expand(3), DT, law).tolist() == bounces
 
 
+def test_by_newton_a_contact_that_closes_no_faster_than_its_forces_make_it_in_a_step_does_not_bounce():
+    before, gained = torch.tensor([-0.09, -0.1, -0.05, -0.05]), torch.tensor([0.0981, 0.0981, 0.0, -0.2])
+    closing = closing_speed(torch.zeros(4), before, before - gained, DT, "newton")
+    assert closing.tolist() == [0.0, 0.1, 0.05, 0.0]  # the last is lifted and does not close
+
+
 def published(name: str, data: dict) -> tuple[Contacts, Tensor, Tensor]:
     """A friction problem given by its Delassus matrix W, free speeds and mu, as contacts of a made-up body."""
     W, speed, mu = (torch.tensor(np.asarray(data[f"{key}/{name}"])) for key in ("W", "wq", "mu"))
