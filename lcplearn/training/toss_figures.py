@@ -87,7 +87,7 @@ def animation(toss: Toss, *, every: int = 3) -> bytes:
     """The same as a GIF, every third row at a quarter of the speed."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    figure, (ax,) = _scenes(1, (4.2, 3.4))
+    figure, (ax,) = _scenes(1, (5.0, 3.4))
     limits = _limits(toss)
 
     def show(row: int) -> list[Any]:
@@ -100,7 +100,7 @@ def animation(toss: Toss, *, every: int = 3) -> bytes:
     moving = FuncAnimation(figure, show, frames=rows)
     with TemporaryDirectory() as folder:  # PillowWriter writes to a path only
         path = Path(folder) / "toss.gif"
-        moving.save(path, writer=PillowWriter(fps=round(1.0 / (4.0 * every * toss.dt))), dpi=72)
+        moving.save(path, writer=PillowWriter(fps=round(1.0 / (4.0 * every * toss.dt))), dpi=84)
         return path.read_bytes()
 
 
@@ -199,7 +199,7 @@ def _frame(ax: Any, toss: Toss, row: int, limits: Sequence[tuple[float, float]])
     (x0, x1), (y0, y1), (z0, z1) = limits
     board = [(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)]
     ax.computed_zorder = False  # matplotlib would guess which of two bodies is in front
-    ax.add_collection3d(Poly3DCollection([board], facecolor="0.95", edgecolor="0.75", zorder=1))
+    ax.add_collection3d(Poly3DCollection([board], facecolor="0.95", edgecolor="0.75", zorder=1, clip_on=False))
     learned = cube if toss.corners is None else toss.corners
     bodies = (
         (toss.recorded[row], cube, {"facecolor": (0.2, 0.2, 0.2, 0.12), "edgecolor": "0.45", "linewidth": 1.6}),
@@ -208,9 +208,9 @@ def _frame(ax: Any, toss: Toss, row: int, limits: Sequence[tuple[float, float]])
     for zorder, (state, shape, style) in enumerate(bodies, 2):
         points = state[:3] + shape @ rotation_matrix(state[3:7] / state[3:7].norm()).mT
         faces = [points[[a, b, d, c]].tolist() for a, b, c, d in FACES]
-        ax.add_collection3d(Poly3DCollection(faces, zorder=zorder, **style))
+        ax.add_collection3d(Poly3DCollection(faces, zorder=zorder, clip_on=False, **style))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), zlim=(z0, z1))
-    ax.set_box_aspect((x1 - x0, y1 - y0, z1 - z0), zoom=1.5)
+    ax.set_box_aspect((x1 - x0, y1 - y0, z1 - z0), zoom=1.2)
     ax.set_axis_off()
 
 
