@@ -116,11 +116,12 @@ class TossedCube(Moving):
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one step; the mode is that of each corner, in the last of the substeps."""
-        steps = [self.substep(self._fallen(state, 1.0), drive)]
+        body = self.body
+        steps = [self.substep(self._fallen(body, state, 1.0), drive)]
         while len(steps) < self.substeps:
             steps.append(self.substep(steps[-1].state, drive))
         solved = torch.stack([step.solved for step in steps if step.solved is not None]).all(0)
-        return steps[-1]._replace(state=self._fallen(steps[-1].state, -1.0), solved=solved)
+        return steps[-1]._replace(state=self._fallen(body, steps[-1].state, -1.0), solved=solved)
 
     def substep(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one of the substeps."""
@@ -128,19 +129,21 @@ class TossedCube(Moving):
 
     def fused_rollout(self, state: Tensor, drive: Drive) -> Trajectory | None:
         """As `SpatialBody.fused_rollout`."""
-        n = self.substeps
+        n, body = self.substeps, self.body
         drive = drive.map(lambda x: x.repeat_interleave(n, dim=-2))
-        path = self.body.fused_rollout(self._fallen(state, 1.0), drive)
+        path = body.fused_rollout(self._fallen(body, state, 1.0), drive)
         if path is None or path.solved is None or n == 1:
             return path
-        rows = self._fallen(path.states[..., ::n, :].movedim(-2, 0), -1.0).movedim(0, -2)
+        rows = self._fallen(body, path.states[..., ::n, :].movedim(-2, 0), -1.0).movedim(0, -2)
         return Trajectory(*POSE.split(rows), path.mode[..., n - 1 :: n, :], path.solved.unflatten(-1, (-1, n)).all(-1))
 
-    def _fallen(self, state: Float[Tensor, "*#batch 13"], steps: float) -> Float[Tensor, "*#batch 13"]:
+    def _fallen(
+        self, body: SpatialBody, state: Float[Tensor, "*#batch 13"], steps: float
+    ) -> Float[Tensor, "*#batch 13"]:
         """The state with that much of g (dt - h) / 2 added to its velocity, if no corner touches."""
         if self.substeps == 1:
             return state
-        body, (position, _) = self.body, POSE.split(state)
+        position, _ = POSE.split(state)
         corners = body.corners @ rotation_matrix(position[..., 3:])[..., 2, :, None]
         gap = position[..., 2] + corners[..., 0].amin(-1) - self.radius - self.ground
         more = torch.zeros_like(state)
