@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from training.helpers import ROOT
 
+from lcplearn.benchmark.tosses.run import ABLATIONS
 from lcplearn.datasets import Recordings, Task, simulate_falling_block, simulate_sliding_block
 from lcplearn.datasets.simulate_planar import simulate_planar_block, simulate_planar_body
 from lcplearn.datasets.spring import simulate_spring_block
@@ -42,6 +43,7 @@ def settings(*overrides: str) -> dict[str, Any]:
 
 EVERY = [f"{group}={name}" for group in ("model", "loss", "optimizer", "trainer", "logger") for name in names(group)]
 EVERY += [f"experiment={name}" for name in names("experiment")] + ["data=cube_slides model=mlp"]
+EVERY += [" ".join(("experiment=cube_body", *more)) for more in ABLATIONS.values() if more]
 EVERY = [choice.replace("model=identified", "data=spring model=identified") for choice in EVERY]
 EVERY = [choice.replace("model=falling", "data=falling_block model=falling") for choice in EVERY]
 EVERY = [choice.replace("model=planar", "data=planar_block model=planar") for choice in EVERY]

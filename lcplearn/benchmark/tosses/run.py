@@ -51,7 +51,7 @@ ABLATIONS = {  # what is overridden in experiment=cube_body
     "horizon of 32 rows": ("loss.horizon=32",),
     "horizon of 64 rows": ("loss.horizon=64",),
     "one friction": ("~model.learn.mu_impact",),
-    "compliance learned": ("~model.fixed.compliance", "+model.learn.compliance=0.01"),
+    "compliance learned": ("+model.learn.compliance=0.01",),
     "one substep": ("model.fixed.substeps=1",),
     "four substeps": ("model.fixed.substeps=4",),
     "continuous restitution": ("model.fixed.restitution_law=continuous",),
