@@ -144,7 +144,7 @@ class TossedCube(Moving):
         if self.substeps == 1:
             return state
         position, _ = POSE.split(state)
-        corners = body.corners @ rotation_matrix(position[..., 3:])[..., 2, :, None]
+        corners = body.corners.to(state) @ rotation_matrix(position[..., 3:])[..., 2, :, None]
         gap = position[..., 2] + corners[..., 0].amin(-1) - self.radius - self.ground
         more = torch.zeros_like(state)
         more[..., 9] = -steps * self.gravity * (self.dt - body.dt) / 2.0

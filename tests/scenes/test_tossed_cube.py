@@ -71,6 +71,13 @@ def test_substeps_are_steps_of_a_shorter_time_from_the_velocity_of_the_last_of_t
     torch.testing.assert_close(behind[..., [0, 1, 3, 4, 5]], torch.zeros(6, 41, 5, dtype=torch.float64))
 
 
+def test_with_substeps_a_cube_may_be_tossed_in_single_precision():
+    cube = TossedCube(**ROUNDED, substeps=2)
+    path = rollout(cube, start(2.5), PUSH.map(lambda x: x[:, :8]))
+    single = rollout(cube, start(2.5).float(), PUSH.map(lambda x: x[:, :8].float()))
+    torch.testing.assert_close(single.states.double(), path.states, rtol=0, atol=1e-3)
+
+
 @pytest.mark.parametrize("n", [2, 3])
 def test_with_substeps_steps_make_the_rollout_and_a_batch_is_its_elements(n: int):
     mu = torch.linspace(0.1, 0.4, 6, dtype=torch.float64)
