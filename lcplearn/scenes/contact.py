@@ -7,7 +7,7 @@ for contacts that close, checks the others afterwards, and adds what it was wron
 from collections.abc import Callable
 from functools import wraps
 from types import ModuleType
-from typing import Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Literal, NamedTuple, ParamSpec, TypeVar, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -77,6 +77,17 @@ class ContactStep(NamedTuple):
     at_rest: Bool[Tensor, "*batch"]
     solved: Bool[Tensor, "*batch"]
     settled: Bool[Tensor, "*batch"]
+
+
+def check_law(restitution_law: str) -> None:
+    """Refuse a law of restitution that there is not.
+
+    Raises:
+        ValueError: It is none of `RestitutionLaw`.
+    """
+    if restitution_law not in get_args(RestitutionLaw):
+        known = " or ".join(map(repr, get_args(RestitutionLaw)))
+        raise ValueError(f"restitution_law: expected {known}, got {restitution_law!r}")
 
 
 def closing_speed(

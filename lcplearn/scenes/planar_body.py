@@ -9,7 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check, check_numbers
-from lcplearn.scenes.contact import Contacts, ContactStep, RestitutionLaw, closing_speed, contact_step, rebound
+from lcplearn.scenes.contact import (
+    Contacts,
+    ContactStep,
+    RestitutionLaw,
+    check_law,
+    closing_speed,
+    contact_step,
+    rebound,
+)
 from lcplearn.scenes.numbers import Number, as_tensor, matvec, stack_numbers
 from lcplearn.scenes.scene import Drive, Moving, Step
 from lcplearn.scenes.space import PLANE, Space
@@ -41,7 +49,7 @@ class PlanarBody(Moving):
     Status: `Step.solved`: the LCP was solved and the contacts settled.
 
     Raises:
-        ValueError: A number is out of its domain, or corners have another shape.
+        ValueError: A number is out of its domain, corners have another shape, or there is no such restitution_law.
 
     Source: Stewart and Trinkle 1996; NOTES 5.7.
     """
@@ -67,6 +75,7 @@ class PlanarBody(Moving):
 
     def __post_init__(self) -> None:
         check_numbers(self)
+        check_law(self.restitution_law)
         if self.corners.ndim < 2 or self.corners.shape[-1] != 2:
             raise ValueError(f"corners: expected shape [*batch, C, 2], got {list(self.corners.shape)}")
 

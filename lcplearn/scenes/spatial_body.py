@@ -13,6 +13,7 @@ from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check,
 from lcplearn.scenes.contact import (
     Contacts,
     RestitutionLaw,
+    check_law,
     closing_speed,
     compiled_contacts,
     contact_step,
@@ -87,6 +88,7 @@ class SpatialBody(Moving):
     def __post_init__(self) -> None:
         check_numbers(self)
         check(POSITIVE, impact_speed=self.impact_speed)
+        check_law(self.restitution_law)
         if self.corners.ndim < 2 or self.corners.shape[-1] != 3:
             raise ValueError(f"corners: expected shape [*batch, C, 3], got {list(self.corners.shape)}")
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
-from lcplearn.scenes.contact import RestitutionLaw
+from lcplearn.scenes.contact import RestitutionLaw, check_law
 from lcplearn.scenes.contact_violation import contact_violation
 from lcplearn.scenes.numbers import Number
 from lcplearn.scenes.scene import Drive, Moving, Step, Trajectory
@@ -71,6 +71,7 @@ class TossedCube(Moving):
     def __post_init__(self) -> None:
         check(POSITIVE, half_width=self.half_width)
         check(NOT_NEGATIVE, radius=self.radius)
+        check_law(self.restitution_law)
         if self.substeps < 1:
             raise ValueError(f"substeps: expected at least 1, got {self.substeps}")
 

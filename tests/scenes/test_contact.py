@@ -16,13 +16,16 @@ from lcplearn.scenes.contact import (
     Contacts,
     ContactStep,
     _flatten,
+    check_law,
     closing_speed,
     compiled_contacts,
     contact_step,
     rebound,
 )
 from lcplearn.scenes.contact_solve import _iterate, find
-from lcplearn.scenes.spatial_body import box_corners
+from lcplearn.scenes.planar_body import PlanarBody, rectangle
+from lcplearn.scenes.spatial_body import SpatialBody, box_corners
+from lcplearn.scenes.tossed_cube import TossedCube
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -311,6 +314,23 @@ def test_by_newton_a_contact_that_closes_no_faster_than_its_forces_make_it_in_a_
     before, gained = torch.tensor([-0.09, -0.1, -0.05, -0.05]), torch.tensor([0.0981, 0.0981, 0.0, -0.2])
     closing = closing_speed(torch.zeros(4), before, before - gained, DT, "newton")
     assert closing.tolist() == [0.0, 0.1, 0.05, 0.0]  # the last is lifted and does not close
+
+
+def test_a_law_of_restitution_that_there_is_not_is_refused_by_name():
+    """Else the compiled code would take another one."""
+    for law in ("newton", "continuous"):
+        check_law(law)
+    with pytest.raises(ValueError, match=r"^restitution_law: expected 'newton' or 'continuous', got 'bounce'"):
+        check_law("bounce")
+    bodies = (
+        (SpatialBody, {"corners": box_corners(torch.ones(3)), "inertia": 1.0}),
+        (PlanarBody, {"corners": rectangle(1.0, 1.0), "inertia": 1.0}),
+        (TossedCube, {"half_width": 1.0, "inertia": 1.0}),
+    )
+    for scene, numbers in bodies:
+        # a wrong literal is a TypeError first where the tests check types
+        with pytest.raises((ValueError, TypeError), match="restitution_law"):
+            scene(**numbers, mu=0.5, dt=0.01, restitution_law="bounce")
 
 
 def published(name: str, data: dict) -> tuple[Contacts, Tensor, Tensor]:
