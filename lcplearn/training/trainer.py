@@ -92,7 +92,7 @@ def run(
 def quiet() -> Iterator[None]:
     """Silence, by message and for the time of a training, what a user can't act on."""
     names = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "fabric.utilities.distributed")
-    loggers = [logging.getLogger(f"lightning.{name}") for name in names]
+    loggers = [logging.getLogger(name) for name in (*(f"lightning.{name}" for name in names), "matplotlib.animation")]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         for message in (

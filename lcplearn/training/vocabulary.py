@@ -40,11 +40,12 @@ def explain(message: str, conf: Path, own: Iterable[Path] = ()) -> str:
             return unknown(key, conf)
         if key in in_files:
             return (
-                f"'{named[1]}' is set in the file of another {group}= than the chosen one; "
+                f"'{named[1]}' is set in the file of another {group.partition('.')[0]}= than the chosen one; "
                 f"if the chosen one takes it, too, write +{named[1]}=..."
             )
         theirs = {name for folder in own for names in vocabulary(folder, group) for name in names}
-        return f"Unknown setting '{named[1]}'; {suggestion(key, in_files | in_code | theirs, f'{group}.')}"
+        more = f" To add it, write +{named[1]}=..." if "." in group else ""  # model.learn, model.fixed: as a scene has
+        return f"Unknown setting '{named[1]}'; {suggestion(key, in_files | in_code | theirs, f'{group}.')}{more}"
     several = re.search(r"Ambiguous value for argument '([^']+)'", message)
     if several:
         return f"{several[1]} are several values: -m before the settings trains one run after the other."
@@ -72,10 +73,13 @@ def unknown(key: str, conf: Path) -> str:
 
 @functools.cache  # a sweep asks for each of its runs
 def vocabulary(conf: Path, group: str) -> tuple[set[str], set[str]]:
-    """Keys of a group's files, and those that its targets accept besides."""
-    files = list((conf / group).glob("*.yaml")) if group else [conf / "train.yaml"]
+    """Keys of a group's files, or of a mapping in them (model.learn), and those that its targets accept besides."""
+    folder, *inside = group.split(".")
+    files = list((conf / folder).glob("*.yaml")) if group else [conf / "train.yaml"]
     contents = [yaml.safe_load(file.read_text()) or {} for file in files]
-    contents = [content.get(group, content) for content in contents]  # files of package _global_ name their group
+    contents = [content.get(folder, content) for content in contents]  # files of package _global_ name their group
+    for name in inside:
+        contents = [content[name] for content in contents if isinstance(content.get(name), dict)]
     in_files = {key for content in contents for key in content if not key.startswith("_")} - {"defaults"}
     if not group:
         return in_files | {folder.name for folder in conf.iterdir() if folder.is_dir()}, set()

@@ -224,6 +224,16 @@ def test_processes_of_torchrun_that_would_write_two_runs_are_refused(arguments: 
             "if the chosen one takes it, too, write +data.path=...",
         ),
         (
+            "experiment=cube_body model.fixed.substep=4",
+            "Unknown setting 'model.fixed.substep'; did you mean 'model.fixed.substeps'? "
+            "To add it, write +model.fixed.substep=...",
+        ),
+        (
+            "experiment=cube_body model.learn.gravity=9",
+            "'model.learn.gravity' is set in the file of another model= than the chosen one; "
+            "if the chosen one takes it, too, write +model.learn.gravity=...",
+        ),
+        (
             "model=affine,mlp",
             "model=affine,mlp are several values: -m before the settings trains one run after the other.",
         ),
@@ -246,7 +256,7 @@ def test_processes_of_torchrun_that_would_write_two_runs_are_refused(arguments: 
 )
 def test_hydras_messages_become_sentences_with_a_suggestion(overrides: str, sentence: str) -> None:
     with pytest.raises(HydraException) as error:
-        settings(overrides)
+        settings(*overrides.split())
     assert explain(str(error.value), CONF) == sentence
 
 

@@ -24,6 +24,7 @@ from lcplearn.scenes import PLANE
 from lcplearn.training import Optimizer, TrainingDivergedError, TrainingInterrupted, figures, fit, load
 from lcplearn.training.figures_of_merit import KEYS
 from lcplearn.training.metrics import Predictions, evaluate, format_table
+from lcplearn.training.trainer import quiet
 from lcplearn.training.writing import replace, write_figures
 
 FRICTION = {"direct": "physical", "slack": "slack"}
@@ -515,3 +516,11 @@ def test_kill_9_leaves_checkpoints_that_load(tmp_path: Path) -> None:
     """`python tests/training/kill.py` does it 50 times, with large files and on two file systems."""
     for number, moment in enumerate((0.05, 0.3)):
         assert kill_once(tmp_path / str(number), tmp_path, 50, moment) == (0, 0)
+
+
+def test_a_training_does_not_say_how_its_pictures_are_written(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        with quiet():
+            logging.getLogger("matplotlib.animation").info("Animation.save using a writer")
+        logging.getLogger("matplotlib.animation").info("not in a training")
+    assert caplog.messages == ["not in a training"]
