@@ -66,7 +66,8 @@ class ContactStep(NamedTuple):
         friction_impulse: Along the contact's T tangents [N s].
         mode: `Mode` of each contact.
         at_rest: Whether sticking contacts hold all of the velocity, so that its 0 was written and not computed.
-        solved: Whether the last LCP was solved.
+        solved: Whether what was solved last (see NOTES 5.7) was, and by it no contact sinks, nor opens under load, by
+            more than 1e-8 of the speeds in question. False where no velocity does that: between walls that close.
         settled: Whether the cone's fixed point was reached; always where there is at most one friction direction.
     """
 

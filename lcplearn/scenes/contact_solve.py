@@ -23,6 +23,7 @@ from lcplearn.scenes.friction_lcp import (
     cone_lcp,
     frictionless_lcp,
     law_violation,
+    normals_hold,
     polygon_lcp,
     regularisation,
 )
@@ -59,7 +60,7 @@ def find(problem: Problem, polygon: int | None, rest: bool) -> tuple[Answer, Ten
             answer.put(elements, rows, found)
         new = (problem.excess(answer.velocity) < -tolerance) & ~active
         active = active | new
-    answer = answer._replace(solved=answer.solved & problem.excess(answer.velocity).isfinite().all(-1))
+    answer = answer._replace(solved=answer.solved & normals_hold(problem, answer))
     return answer, _at_rest(problem, answer) if rest else torch.zeros_like(answer.solved)
 
 

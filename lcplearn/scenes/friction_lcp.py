@@ -43,6 +43,7 @@ PLAIN = 12  # of them before the proximal term
 PATIENCE = 40  # of them before the proximal term grows, and grows again at the last resort
 LAST_RESORT = 70
 SETTLED = 3e-14  # violation of the law as a speed, relative to that of free flight and to what the load can cause
+HEAVY = 3e5  # the latter up to so many times the former: where no velocity obeys the law, loads grow until all is small
 DEAD_ZONE = 1e-6  # normal speed of a loaded contact that counts as none, relative to the free velocity
 DEAD_SLIP = 1e-10  # slip of one, likewise
 FULL_RANK = 1e-6  # smallest eigenvalue of the rows that hold a body at rest, relative to their largest diagonal
@@ -226,12 +227,20 @@ def law_violation(problem: Problem, answer: Answer) -> Tensor:
 
     |f - P(f - slip / a)| a, with P the projection onto the disc of radius mu lambda and a the mobility.
     """
-    a, limit = problem.mobility(), problem.mu * answer.normal
+    a, limit, scale = problem.mobility(), problem.mu * answer.normal, problem.speed_scale()
     pushed = answer.friction - answer.slip / a.unsqueeze(-1)
     size = torch.linalg.vector_norm(pushed, dim=-1)
     factor = torch.where(size > limit, limit / size.clamp_min(1e-300), 1.0)
     wrong = torch.linalg.vector_norm(answer.friction - factor.unsqueeze(-1) * pushed, dim=-1)
-    return (a * wrong / (problem.speed_scale() + a * answer.normal).clamp_min(1e-300)).amax(-1)
+    return (a * wrong / (scale + torch.minimum(a * answer.normal, HEAVY * scale)).clamp_min(1e-300)).amax(-1)
+
+
+def normals_hold(problem: Problem, answer: Answer) -> Tensor:
+    """Where [B] no contact sinks, and none that is loaded opens, by more than `CRUDE`; and all is finite."""
+    opening, scale = problem.excess(answer.velocity), problem.speed_scale()
+    loaded = answer.normal > 0.0
+    opening = torch.where(loaded, -(opening + problem.compliance * answer.normal).abs(), opening)
+    return ((opening >= -CRUDE * scale) & opening.isfinite() & scale.isfinite()).all(-1)
 
 
 def polygon_lcp(problem: Problem, k: int) -> Answer:

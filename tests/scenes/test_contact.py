@@ -280,6 +280,55 @@ def test_nothing_goes_back_through_a_step_that_is_not_solved(compiled, polygon, 
     assert (start[5] == 0.0).all()
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_no_velocity_can_obey_is_not_solved(compiled, monkeypatch):
+    """A particle between walls that close, level or or tilted, with friction that holds it; the last is free."""
+    if not compiled:
+        monkeypatch.setattr("lcplearn.scenes.contact.compiled_contacts", lambda device: None)
+    tilt = torch.tensor([0.0, 0.0, 0.1, 0.1, 1.5])
+    c, s, o = tilt.cos(), tilt.sin(), torch.zeros(5)
+    floor = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).expand(5, 3, 3)
+    roof = torch.stack((torch.stack((s, o, -c), -1), torch.stack((c, o, s), -1), floor[:, 2]), dim=1)
+    rows = torch.stack((floor, roof), dim=1)
+    contacts = Contacts(
+        gap=torch.full((5, 2), -1e-3),
+        normal=rows[:, :, 0],
+        tangents=rows[:, :, 1:],
+        mu=torch.tensor([[0.0], [2.0], [0.5], [2.0], [0.5]]),
+        bounce=torch.zeros(5, 1),
+        compliance=torch.zeros(5, 1),
+    )
+    step = contact_step(contacts, torch.tensor([0.3, 0.2, -0.1]), torch.ones(3), DT)
+    assert step.solved.tolist() == [False] * 4 + [True]
+
+
+def test_rows_at_random_are_solved_within_the_law_or_told_to_be_unsolved():
+    """More rows than a body has velocities: for 3 of 10 no velocity obeys the law, but loads of 1e15 hide it."""
+    draw, count = torch.Generator().manual_seed(3), 20000
+    contacts = Contacts(
+        gap=0.01 * torch.randn(count, 4, generator=draw) * (torch.rand(count, 4, generator=draw) < 0.5),
+        normal=torch.randn(count, 4, 3, generator=draw),
+        tangents=torch.randn(count, 4, 2, 3, generator=draw),
+        mu=torch.rand(count, 4, generator=draw),
+        bounce=torch.zeros(count, 1),
+        compliance=torch.zeros(count, 1),
+    )
+    free = torch.randn(count, 3, generator=draw)
+    step = contact_step(contacts, free, torch.ones(3), DT, rest=False)
+    opening = torch.einsum("bcv,bv->bc", contacts.normal, step.velocity) + contacts.gap / DT
+    wrong = torch.where(step.normal_impulse > 0.0, opening.abs(), -opening).amax(-1)
+    right = step.solved & step.settled
+    assert right.sum() > 0.7 * count
+    assert wrong[right].amax() < 1e-6
+
+
+def test_speeds_whose_squares_overflow_are_not_solved():
+    contacts, free, mass = boxes(20, 1)
+    step = contact_step(contacts, 1e160 * free, mass, DT)
+    flies = (step.normal_impulse == 0.0).all(-1)
+    assert not step.solved[~flies].any()
+
+
 def test_a_batch_of_gradients_is_refused():
     contacts, free, mass = boxes(2, 1)
     velocity = contact_step(contacts, free.requires_grad_(), mass, DT).velocity

@@ -9,6 +9,7 @@ from lcplearn.scenes.contact_kernel.memory import cone_memory
 from lcplearn.scenes.contact_kernel.rows import apply, condense, cone_rows, delassus, mass_norm, rotate, solve_lcp
 from lcplearn.scenes.friction_lcp import (
     CRUDE,
+    HEAVY,
     LAST_RESORT,
     MAX_ITERATIONS,
     PLAIN,
@@ -45,7 +46,7 @@ def _law_violation(slip, friction, load, mu, D, scale, K):
         size = sqrt(x * x + y * y)
         factor = limit / size if size > limit else 1.0
         wrong = sqrt((friction[i, 0] - factor * x) ** 2 + (friction[i, 1] - factor * y) ** 2)
-        result = max(result, a * wrong / max(scale[i] + a * load[i], 1e-300))
+        result = max(result, a * wrong / max(scale[i] + min(a * load[i], HEAVY * scale[i]), 1e-300))
     return result
 
 

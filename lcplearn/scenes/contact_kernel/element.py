@@ -10,7 +10,7 @@ from lcplearn.scenes.contact_kernel.cone import solve_cone
 from lcplearn.scenes.contact_kernel.memory import cone_memory, element_memory
 from lcplearn.scenes.contact_kernel.modes import settle_modes
 from lcplearn.scenes.contact_kernel.rows import apply, cholesky, cone_rows, delassus, mass_norm, solve_lcp
-from lcplearn.scenes.friction_lcp import DEAD_SLIP, DEAD_ZONE, FULL_RANK, ROUNDING, SETTLED
+from lcplearn.scenes.friction_lcp import CRUDE, DEAD_SLIP, DEAD_ZONE, FULL_RANK, ROUNDING, SETTLED
 
 
 @compiled
@@ -120,18 +120,20 @@ def _closing(C, nv, target, normal, free, mass, active, unit):
 
 
 @merged
-def _wrong(C, nv, target, normal, v, scale, active):
-    """How many contacts without rows the solution violates, and whether all is finite; they become active."""
-    finite, count = True, 0
+def _wrong(C, nv, target, normal, compliance, v, load, scale, active):
+    """How many contacts without rows the solution violates, and `normals_hold`; they become active."""
+    hold, count = True, 0
     for i in range(C):
-        speed = 0.0
+        opening = -target[i]
         for k in range(nv):
-            speed += normal[i, k] * v[k]
-        finite = finite and abs(speed) <= LARGEST
-        if not active[i] and speed - target[i] < -ROUNDING * scale[i]:
+            opening += normal[i, k] * v[k]
+        if not active[i] and opening < -ROUNDING * scale[i]:
             active[i] = True
             count += 1
-    return count, finite
+        if load[i] > 0.0:
+            opening = -abs(opening + compliance[i] * load[i])
+        hold = hold and -CRUDE * scale[i] <= opening <= LARGEST
+    return count, hold
 
 
 @merged
@@ -153,7 +155,7 @@ def _solve_needed(
     for i in range(C):
         for d in range(T):
             friction[i, d] = 0.0
-    solved, settled, wrong = finite, True, 0.0
+    solved, settled, hold, wrong = True, True, True, 0.0
     while added > 0:
         K = _members(active, index)
         for i in range(K):
@@ -188,9 +190,9 @@ def _solve_needed(
             load[j], sticks[j] = part_load[i], part_sticks[i]
             for d in range(T):
                 friction[j, d] = part_friction[i, d]
-        added, still_finite = _wrong(C, nv, target, normal, v, scale, active)
-        finite = finite and still_finite
-    return solved and finite, settled, not settled and wrong <= accepted
+        added, hold = _wrong(C, nv, target, normal, compliance, v, load, scale, active)
+    solved = solved and finite and hold and energy <= LARGEST
+    return solved, settled, not settled and wrong <= accepted
 
 
 @merged

@@ -18,7 +18,7 @@ import numpy as np
 from lcplearn.scenes.contact_kernel.compiling import compiled, merged
 from lcplearn.scenes.contact_kernel.dense import factorise, solve
 from lcplearn.scenes.contact_kernel.memory import modes_memory
-from lcplearn.scenes.friction_lcp import CREEP, ROUNDING, SETTLED
+from lcplearn.scenes.friction_lcp import CREEP, HEAVY, ROUNDING, SETTLED
 
 OPEN, SLIPS, STICKS = 0, 2, 3  # the number of unknowns
 STEPS = 10
@@ -157,7 +157,7 @@ def _judge(
             opening += rows[i, k] * v[k]
             vx += rows[K + i, k] * v[k]
             vy += rows[2 * K + i, k] * v[k]
-        size, unit = sqrt(vx * vx + vy * vy), max(scale[i] + a * load[i], 1e-300)
+        size, unit = sqrt(vx * vx + vy * vy), max(scale[i] + min(a * load[i], HEAVY * scale[i]), 1e-300)
         if mode[i] == OPEN:
             slip[i, 0], slip[i, 1] = vx, vy
             if opening < -ROUNDING * scale[i]:
