@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lcplearn.domains import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Domain, check
 from lcplearn.scenes.contact import RestitutionLaw, check_law
 from lcplearn.scenes.contact_violation import contact_violation
 from lcplearn.scenes.numbers import Number
-from lcplearn.scenes.scene import Drive, Moving, Step, Trajectory
+from lcplearn.scenes.scene import Drive, Mode, Moving, Step, Trajectory
 from lcplearn.scenes.space import POSE, Space, rotation_matrix
 from lcplearn.scenes.spatial_body import SpatialBody, box_corners
 
@@ -116,13 +116,14 @@ class TossedCube(Moving):
         )
 
     def advance(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
-        """Advance a state by one step; the mode is that of each corner, in the last of the substeps."""
+        """Advance a state by one step; the mode of a corner is that of the last of the substeps in which it touches."""
         body = self.body
         steps = [self.substep(self._fallen(body, state, 1.0), drive)]
         while len(steps) < self.substeps:
             steps.append(self.substep(steps[-1].state, drive))
         solved = torch.stack([step.solved for step in steps if step.solved is not None]).all(0)
-        return steps[-1]._replace(state=self._fallen(body, steps[-1].state, -1.0), solved=solved)
+        mode = _touching(torch.stack([step.mode for step in steps], dim=-2))
+        return steps[-1]._replace(state=self._fallen(body, steps[-1].state, -1.0), mode=mode, solved=solved)
 
     def substep(self, state: Float[Tensor, "*#batch 13"], drive: Drive) -> Step:
         """Advance a state by one of the substeps."""
@@ -136,7 +137,8 @@ class TossedCube(Moving):
         if path is None or path.solved is None or n == 1:
             return path
         rows = self._fallen(body, path.states[..., ::n, :].movedim(-2, 0), -1.0).movedim(0, -2)
-        return Trajectory(*POSE.split(rows), path.mode[..., n - 1 :: n, :], path.solved.unflatten(-1, (-1, n)).all(-1))
+        mode, solved = _touching(path.mode.unflatten(-2, (-1, n))), path.solved.unflatten(-1, (-1, n)).all(-1)
+        return Trajectory(*POSE.split(rows), mode, solved)
 
     def _fallen(
         self, body: SpatialBody, state: Float[Tensor, "*#batch 13"], steps: float
@@ -174,3 +176,11 @@ class TossedCube(Moving):
             velocity.new_tensor([1.0] * 3 + [self.half_width**2] * 3),
             self.dt,
         )
+
+
+def _touching(modes: Int[Tensor, "*batch n C"]) -> Int[Tensor, "*batch C"]:
+    """Mode in the last of n substeps in which a corner touches: an impact in an early one is not lost."""
+    first, *later = modes.unbind(-2)
+    for mode in later:
+        first = torch.where(mode == Mode.SEPARATION, first, mode)
+    return first
