@@ -71,7 +71,7 @@ def rollouts(found: Predictions, count: int = 3) -> "Figure":
     test = task.test.map(lambda values: values[chosen])
     simulated = test.true_states is not None
     velocity, true = (_velocity(model, v) for v in (found.test.velocities[chosen], model.space.split(test.truth)[1]))
-    name = "true" if simulated else "recorded"
+    name, what = "true" if simulated else "recorded", "velocity" if model.space.nv == 1 else "speed"
     for row, ax in enumerate(ax for line in axes for ax in line):
         steps = int(test.steps[row])
         time = torch.arange(steps + 1) * task.dt
@@ -80,7 +80,7 @@ def rollouts(found: Predictions, count: int = 3) -> "Figure":
         low, high = _limits(predicted, true[row, : steps + 1])
         far = 10.0 * max(-low, high)  # outside of the axes, where matplotlib can still draw it
         ax.plot(time, predicted.clamp(-far, far), label="rolled out from the start", **LEARNED)
-        ax.set(ylim=(low - 0.22 * (high - low), high), ylabel="velocity [m/s]")
+        ax.set(ylim=(low - 0.22 * (high - low), high), ylabel=f"{what} [m/s]")
         if simulated:  # a measured velocity is never exactly zero
             strip(ax, time, true[row, : steps + 1], 0.01, "black", "true at rest", alpha=0.35)
         strip(ax, time, velocity[row, : steps + 1], 0.08, "tab:red", "predicted at rest")

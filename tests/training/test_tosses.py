@@ -23,7 +23,8 @@ from lcplearn.scenes.scene import Drive, rollout
 from lcplearn.scenes.space import POSE
 from lcplearn.scenes.spatial_body import box_corners
 from lcplearn.scenes.tossed_cube import TossedCube
-from lcplearn.training import Optimizer, TrainingInterrupted, fit, toss_scores
+from lcplearn.training import Optimizer, TrainingInterrupted, figures, fit, toss_scores
+from lcplearn.training.metrics import Predictions
 
 H, M, DT, STEPS = 0.05, 0.4, 1 / 148, 24
 KNOWN = {"half_width": H, "mass": M, "gravity": 9.81}
@@ -105,6 +106,12 @@ def test_a_network_is_learned_beside_the_numbers_kept_and_drawn(tmp_path: Path):
     assert torch.equal(loaded.law(closing), law)
     assert loaded.physical_parameters().keys() == {"mu", "inertia", "restitution"}
     assert (tmp_path / "law.png").is_file()
+
+
+def test_how_fast_a_cube_is_is_called_a_speed():
+    data = simulated()
+    drawn = figures.rollouts(Predictions(build(Identified, data, scene=TossedCube, learn=TRUE), data), count=2)
+    assert [ax.get_ylabel() for ax in drawn.axes] == ["speed [m/s]"] * 2
 
 
 def test_a_law_of_friction_goes_from_sliding_to_impacts():
