@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Value = float | None
+_LONGEST = 40  # letters of a name in the picture
 # Settings that change nothing in what is learned; any other difference makes another row.
 _SILENT = (
     "seed", "data.seed", "model.seed", "ckpt_path", "allow_changes", "logger.", "trainer.enable_progress_bar",
@@ -121,11 +122,13 @@ def draw(rows: Sequence[Row]) -> "Figure":
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for ax, (x, y, xlabel, ylabel) in zip(all_axes, panels, strict=True):
         for index, row in enumerate(rows):
+            # The table has all of a name that would cover the picture.
+            name = row.label if len(row.label) <= _LONGEST else f"{row.label[:_LONGEST]}... (row {index + 1})"
             # Filled where it sticks, which tells the formulations apart more than any error.
             sticks = (row.values.get("stick_accuracy") or row.values.get("rest_share") or 0.0) >= 0.98
             ax.plot(
                 _shown(row.values.get(x)), _shown(row.values.get(y)), "osD^v"[index // 10 % 5],
-                color=f"C{index % 10}", fillstyle="full" if sticks else "none", markersize=9, mew=1.8, label=row.label,
+                color=f"C{index % 10}", fillstyle="full" if sticks else "none", markersize=9, mew=1.8, label=name,
             )  # fmt: skip
         ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

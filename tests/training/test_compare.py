@@ -85,6 +85,17 @@ def test_tosses_are_sorted_drawn_and_joined_over_seeds_of_their_models(tmp_path:
     assert [float(line.get_ydata()[0]) for line in ax.lines] == [1e-17, 8.5]
 
 
+def test_long_names_leave_the_picture_its_place(tmp_path: Path) -> None:
+    for k in range(2):
+        stages = [{"epochs": epochs, "horizon": 8, "lr": 0.01 * (k + 1)} for epochs in range(9)]
+        run(tmp_path / str(k), "baselines.MLP", {"stages": stages}, velocity_rmse=0.1 + k, predict_us=9.0)
+    figure = compare.draw(compare.read_runs([tmp_path]))
+    figure.draw_without_rendering()
+    assert figure.axes[0].get_position().width > 0.3
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [name.partition("... ")[2] for name in names] == ["(row 1)", "(row 2)"]
+
+
 def test_a_row_is_named_by_what_sets_it_apart(tmp_path: Path) -> None:
     for horizon in (1, 10):
         config = {"loss": {"horizon": horizon}, "logger": {"save_dir": f"runs/{horizon}"}}
