@@ -293,6 +293,18 @@ def test_solution_beyond_the_range_of_doubles_is_not_solved():
     assert solve([[1e-300]], [-1.0]).z[0, 0] == pytest.approx(1e300)
 
 
+@pytest.mark.parametrize("n", [3, 9, 17])
+def test_a_solution_too_small_beside_q_to_be_judged_is_not_solved(n):
+    """z_1 = 1e-6 is a denormal in units of q_0. A z_2 of 0 would leave w_2 = -0.5, and z_2 = 0.5 can be judged."""
+    M, q = np.eye(n), np.ones(n)
+    M[1, 1], M[2, 1], q[0], q[1], q[2] = 1e6, -1e6, 1e304, -1.0, 0.5
+    result = solve(M, q)
+    assert result.status[0] == Status.SOLVED
+    np.testing.assert_allclose(result.z[0], [0.0, 1e-6, 0.5, *[0.0] * (n - 3)])
+    M[2, 1], q[2] = -1e3, 1.0
+    assert solve(M, q).status[0] == Status.UNSOLVED
+
+
 @pytest.mark.parametrize("budget", [10, 20, 40])
 def test_no_problem_takes_more_iterations_than_max_iter(budget):
     generator = torch.Generator().manual_seed(0)

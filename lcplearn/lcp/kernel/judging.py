@@ -70,9 +70,10 @@ def equilibrate_few(M, largest, d):
 
 @jit_merged
 def equilibrate(M, rows, largest, rest, d):
-    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; whether some row is left without a large entry.
+    """Symmetric Ruiz scaling d of M, as in residuals.equilibrate; whether it ends with a row without a large entry.
 
-    rows and largest are scratch; rest gets the end of M's last row, for `scale`.
+    That is not asked where rows and columns together came out even, nor for less than 4 rows. rows and largest are
+    scratch; rest gets the end of M's last row, for `scale`.
     """
     n = d.size
     if n < 4:
@@ -168,14 +169,16 @@ def largest_share(S, z, omega, j):
 
 @jit_merged
 def judge(q, S, p, d, r, c, s, z, w, omega, tol):
-    """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `_evaluate`."""
+    """Residual and tolerance of residuals.judge, for scaled z >= 0 with w and omega of `evaluate`."""
     n = q.size
     smallest = TINY / s if s < 1e-150 else 0.0  # not a denormal, with which arithmetic is slow
     z_size, q_size, natural, noise, rows, absMz, total = smallest, smallest, 0.0, 0.0, 0.0, 0.0, 0.0
     unseen = TINY if s <= 2.0 * TINY else 5e-324  # sizes below TINY count as TINY where all are: then s is TINY's size
-    lost = False  # q spans more than the range of doubles: its small rows are not in p, and nobody has solved them
     for i in range(n):
         z_size = max(z_size, c[i] * z[i])
+    # Where q spans more than the range of doubles, shares of z are not known (1 / z_size may be infinite) or small rows
+    # of q are not in p: nobody has solved them.
+    lost = 0.0 < z_size < TINY
     inverse = 1.0 / z_size if z_size > 0.0 else 0.0
     for i in range(n):
         inverse_r = inverse_of_power(r[i])
