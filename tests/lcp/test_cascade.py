@@ -19,12 +19,14 @@ def test_a_small_diagonal_problem_takes_one_round(n):
     assert (solution.iterations == 1).all()
 
 
-def test_an_element_with_a_zero_on_its_diagonal_takes_the_way_of_lemke():
-    M = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)
-    solution = solve_lcp(torch.block_diag(M, M, M, M), torch.tensor([-1.0, 2.0] * 4, dtype=torch.float64))
-    assert solution.solved
-    assert solution.z.tolist() == [2.0, 1.0] * 4
-    assert solution.iterations > 8
+@pytest.mark.parametrize("d", [[1.0] * 7 + [0.0], [1.0] * 16])
+def test_a_zero_on_the_diagonal_and_more_rows_take_the_way_of_lemke(d):
+    """A pivot for each negative entry, and one more; pivots on the diagonal would end after one round here, too."""
+    diagonal = torch.tensor(d, dtype=torch.float64)
+    q = torch.where(diagonal > 0.0, -1.0, 1.0).to(torch.float64)
+    solution = solve_lcp(torch.diag(diagonal), q)
+    assert solution.z.tolist() == d
+    assert solution.iterations == sum(d) + 1
 
 
 @pytest.mark.parametrize("n", [20, 40])
