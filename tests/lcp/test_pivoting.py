@@ -305,6 +305,18 @@ def test_a_solution_too_small_beside_q_to_be_judged_is_not_solved(n):
     assert solve(M, q).status[0] == Status.UNSOLVED
 
 
+def test_an_entry_of_z_that_is_lost_beside_a_q_near_the_largest_double_is_not_solved():
+    """z_1 = .04 is a denormal in units of q_2: without it w_1 and w_3 are below zero by percents."""
+    M = np.array([[3.76, -2.21, -1.93, 1.23], [1.52, 0.861, 0.917, -0.239], [2.57, -1.69, 0.181, -0.489],
+                  [-0.174, 1.58, -0.0394, 0.694]])  # fmt: skip
+    q = np.array([3.02, 0.862, 4.49e307, -2.68])
+    assert solve(M, q).status[0] == Status.UNSOLVED
+    q[2] *= 1e-8
+    result = solve(M, q)
+    assert result.status[0] == Status.SOLVED
+    assert abs(result.z[0, 1] - 0.0434) < 1e-4
+
+
 @pytest.mark.parametrize("budget", [10, 20, 40])
 def test_no_problem_takes_more_iterations_than_max_iter(budget):
     generator = torch.Generator().manual_seed(0)

@@ -50,6 +50,7 @@ from lcplearn.lcp.kernel.vectors import inverse_of_power
 AHEAD, PRINCIPAL, BLOCK, LEMKE, IMPROVE = range(5)
 APART_BLOCK, APART_LEMKE, APART_COVER, APART_FINE, PATH, REFINED, BY_SCALE, ANEW = range(5, 13)
 AT_ONCE = 16  # elements whose fields are cleared
+NOISE = 1e-150  # a z that was denormal before it was scaled back is no noise above it
 
 
 @jit_merged
@@ -68,7 +69,8 @@ def prepare_lemke(stage, single_precision, cover):
 def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
     """Put a scaled solution into the caller's arrays, with exact zeros; whether these hold it to full precision.
 
-    Where w is rounding noise it is zero too, and so are denormal z: S z has lost them, while M z would not.
+    Where w is rounding noise it is zero too, and so are denormal z: S z has lost them, while M z would not. One that is
+    large for the caller, beside a q near the largest double, is no noise.
     """
     smallest = TINY if s > 4.0 * TINY else 5e-324  # data that are all denormal may have a denormal solution
     outside = 0
@@ -77,7 +79,8 @@ def write(z, w, omega, basis, c, s, r, z_out, w_out, basis_out):
         z_out[i] = c[i] * s * z[i] if holds else 0.0
         w_out[i] = 0.0 if basis[i] or w[i] <= 8.0 * EPS * omega[i] else w[i] * s * inverse_of_power(r[i])
         basis_out[i] = basis[i] != 0
-        outside += not (z_out[i] <= LARGEST and w_out[i] <= LARGEST) or (holds and z_out[i] < smallest)
+        lost = z_out[i] < smallest if holds else basis[i] and c[i] * s * z[i] > NOISE
+        outside += lost or not (z_out[i] <= LARGEST and w_out[i] <= LARGEST)
     return outside == 0
 
 
