@@ -217,9 +217,7 @@ def _make_roll_back(sources: str) -> Any:
     return compiled(_roll_back, cached=True)
 
 
-roll_back = _make_roll_back(
-    fingerprint("contact_gradient.py", "spatial_kernel.py", "spatial_adjoint.py", "spatial_turning.py")
-)
+roll_back = _make_roll_back(fingerprint("spatial_kernel.py", "spatial_adjoint.py", "spatial_turning.py"))
 
 
 def back_scratch(C: int) -> int:

@@ -29,7 +29,8 @@ def fingerprint(*files: str) -> str:
     numba watches one file alone, but a closure's values are part of a function's key.
     """
     here = Path(__file__).parent
-    names = ("friction_lcp.py", "../lcp/kernel/memory.py", "../lcp/kernel/calling.py", *files)
+    layer = (f"../lcp/kernel/{name}.py" for name in ("calling", "jit", "memory"))
+    names = ("contact_gradient.py", "friction_lcp.py", *layer, *files)
     sources = [*sorted(here.glob("*.py")), *(here.parent / name for name in names)]
     return sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 

@@ -98,7 +98,7 @@ def _make_pull_back_all(sources: str) -> Any:
 
 
 _solve_all = _make_solve_all(fingerprint())
-_pull_back_all = _make_pull_back_all(fingerprint("contact_gradient.py"))
+_pull_back_all = _make_pull_back_all(fingerprint())
 
 
 @cache
