@@ -160,7 +160,7 @@ def test_falling_recordings_are_rollouts_of_the_scene_that_never_penetrate():
     data = simulate_falling_block(noise=0.01)
     part = data.train
     start = torch.stack((part.states[:, 0, 0], part.true_states[:, 0, 1]), dim=-1)
-    path = FallingBlock(data.truth["mass"], data.dt).rollout(start, part.drive.force)
+    path = FallingBlock(data.given["mass"], data.dt).rollout(start, part.drive.force)
     assert torch.equal(part.true_states[..., 1], path.velocities[..., 0])
     assert torch.equal(part.states[..., 0], path.positions[..., 0])
     assert part.states[..., 0].min() == 0
