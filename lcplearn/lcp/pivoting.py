@@ -64,7 +64,7 @@ def solve_batch(
 
     Cost: O(n^3) per principal block, O(n^2) per Lemke pivot; memory O(B n + n^2).
     """
-    shape = q.shape
+    shape = tuple(q.shape)  # numpy takes longer to read a torch.Size
     batch, n = shape[:-1], shape[-1]
     new, empty = torch.from_numpy, np.empty  # as `_empty`, whose calls are a tenth of a small solve
     z, w, certificate, residual = new(empty(shape)), new(empty(shape)), new(empty(shape)), new(empty(batch))
@@ -167,7 +167,7 @@ def solve_adjoint(
 
 def _empty(shape: tuple[int, ...], dtype: type = np.float64) -> Tensor:
     """An uninitialised tensor on the CPU, in half the time that torch.empty takes."""
-    return torch.from_numpy(np.empty(shape, dtype))
+    return torch.from_numpy(np.empty(tuple(shape), dtype))
 
 
 def address(x: Tensor | None, start: int = 0) -> int:
