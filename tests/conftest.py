@@ -24,3 +24,11 @@ def _one_thread() -> None:
     import torch  # not before: who only hands tests to workers has no need of it
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def no_pause() -> None:
+    """Threads are not paused by what ran before on a busy machine."""
+    from lcplearn.lcp import threads
+
+    threads._pause.end = 0.0

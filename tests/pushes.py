@@ -1,6 +1,11 @@
 """Small files of pushes, drawn by hand: for tests that need no real data."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+
+from lcplearn.datasets.pushes import PushData
 
 
 def push_arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
@@ -37,3 +42,15 @@ def push_arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
         "object_com": np.array([0.05, 0.05]),
         "object_mass": np.float64(1.5),
     }
+
+
+def push_file(folder: Path, count: int) -> Path:
+    """A file of so many pushes."""
+    path = folder / "pushes.npz"
+    np.savez(path, **push_arrays(count))
+    return path
+
+
+def thing(data: PushData) -> dict[str, Any]:
+    """The object that was pushed: what every model of pushes is built from."""
+    return {"vertices": data.vertices.tolist(), "com": data.com.tolist(), "mass": data.mass}

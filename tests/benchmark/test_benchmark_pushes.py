@@ -2,10 +2,9 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
-from pushes import push_arrays
+from pushes import push_file
 
 from lcplearn.benchmark.pushes.planning import CLEARANCE, FEW, plan, push_of, random_actions, wanted_poses
 from lcplearn.benchmark.pushes.run import right_gradients, thing
@@ -15,9 +14,7 @@ from lcplearn.formulations.pushing import Supports
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    path = tmp_path_factory.mktemp("pushes") / "pushes.npz"
-    np.savez(path, **push_arrays(8))
-    return read_all_pushes(path)
+    return read_all_pushes(push_file(tmp_path_factory.mktemp("pushes"), 8))
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,12 @@ import copy
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from pushes import push_arrays
+from pushes import push_file, thing
 from real_data import real_data
 
-from lcplearn.datasets.pushes import PushData, read_all_pushes
+from lcplearn.datasets.pushes import read_all_pushes
 from lcplearn.formulations.pushing import PushMLP, Residual, Ridge, Supports
 from lcplearn.formulations.pushing.baselines import _kernel
 from lcplearn.formulations.pushing.features import features
@@ -25,15 +24,9 @@ CHECKPOINTS = Path(__file__).parents[2] / "data" / "checkpoints"
 COARSE = {"steps": 5}  # the pushes of `known` are made by the same steps
 
 
-def thing(data: PushData) -> dict:
-    return {"vertices": data.vertices.tolist(), "com": data.com.tolist(), "mass": data.mass}
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    path = tmp_path_factory.mktemp("pushes") / "pushes.npz"
-    np.savez(path, **push_arrays(24))
-    return read_all_pushes(path)
+    return read_all_pushes(push_file(tmp_path_factory.mktemp("pushes"), 24))
 
 
 @pytest.fixture(scope="module")

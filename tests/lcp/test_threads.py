@@ -14,13 +14,7 @@ from lcp.workers import threads_of_two_slices
 from lcplearn import solve_lcp
 from lcplearn.lcp import pivoting, threads
 
-
-@pytest.fixture(autouse=True)
-def _threads():
-    before = torch.get_num_threads()
-    threads._pause.end = 0.0
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("no_pause")
 
 
 def _everything(M, q, count):

@@ -14,15 +14,7 @@ from lcplearn.scenes.scene import Drive, rollout
 from lcplearn.scenes.tossed_cube import TossedCube
 
 pytest.importorskip("numba")
-pytestmark = pytest.mark.usefixtures("double_precision")
-
-
-@pytest.fixture(autouse=True)
-def _threads():
-    before = torch.get_num_threads()
-    threads._pause.end = 0.0
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("double_precision", "no_pause")
 
 
 def _step(count: int) -> list[Tensor]:

@@ -5,10 +5,9 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from pushes import push_arrays
+from pushes import push_file, thing
 
 from lcplearn.datasets.pushes import PushData, read_pushes
 from lcplearn.formulations.pushing import PushModel, PushPrediction, Ridge
@@ -33,13 +32,7 @@ class Parrot(PushModel):
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> PushData:
-    path = tmp_path_factory.mktemp("pushes") / "pushes.npz"
-    np.savez(path, **push_arrays(12))
-    return read_pushes(path, folds=3)
-
-
-def thing(data: PushData) -> dict:
-    return {"vertices": data.vertices.tolist(), "com": data.com.tolist(), "mass": data.mass}
+    return read_pushes(push_file(tmp_path_factory.mktemp("pushes"), 12), folds=3)
 
 
 def test_no_push_is_judged_by_a_model_that_was_fitted_to_it(data: PushData, tmp_path: Path) -> None:
